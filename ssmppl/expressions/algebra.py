@@ -50,6 +50,7 @@ ONE: Monomial = frozenset()
 Terms = dict[Monomial, list[Expr]]  # coefficient as a list of summands
 Matrix = Callable[[np.ndarray], np.ndarray]
 MAX_TERMS = 600  # of a product that is multiplied out
+MAX_SUMMANDS = 2000  # of all its coefficients together, before what is alike is gathered
 POINTS = 64  # at which a form is compared with what it was made of
 _CONGRUENCE_POINTS = 4
 _TOLERANCE = 1e-11
@@ -328,13 +329,16 @@ class _Separator:
 
     def _multiply(self, a: Terms, b: Terms) -> Terms:
         out: Terms = {}
+        size = 0
         for ma, ca in a.items():
             for mb, cb in b.items():
                 coefficient = summed(ca) * summed(cb)
                 for m, parts in self._combine(ma, mb).items():
                     out.setdefault(m, []).extend(coefficient * p for p in parts)
-        if len(out) > MAX_TERMS:
-            raise NotSeparable(constant(0.0), f"more than {MAX_TERMS} terms when multiplied out")
+                    size += len(parts)
+            if len(out) > MAX_TERMS or size > MAX_SUMMANDS:
+                most = f"{MAX_TERMS} terms" if len(out) > MAX_TERMS else f"{MAX_SUMMANDS} summands"
+                raise NotSeparable(constant(0.0), f"more than {most} when multiplied out")
         return out
 
     def _combine(self, a: Monomial, b: Monomial) -> Terms:
@@ -559,22 +563,19 @@ def polynomial(
     expression: Expr, symbols: Sequence[Expr], degree: int
 ) -> dict[tuple[Expr, ...], Expr] | NotApplicable:
     """Coefficients by monomial (the symbols of it, in the order given, repeated by power)."""
-    separation = separate(expression, symbols)
-    if not isinstance(separation, Separation):
-        return separation
+    try:
+        terms = _Separator([expression], symbols).terms_of(expression)
+    except NotSeparable as failure:
+        return NotApplicable(failure.reason)
     rank = {s: i for i, s in enumerate(symbols)}
+    refusals = {m: r for m in terms if (r := _refusal(m, rank, degree)) is not None}
+    for monomial, reason in refusals.items():  # before all others are gathered, which takes long
+        if gathered({monomial: terms[monomial]}):
+            return NotApplicable(reason)
+    separation = Separation(gathered({m: c for m, c in terms.items() if m not in refusals}))
     out = {}
     for monomial, coefficient in separation.terms.items():
-        key: list[Expr] = []
-        for atom, exponent in monomial:
-            if atom not in rank or exponent != int(exponent) or exponent < 0:
-                names = ", ".join(sorted({s.data[1] for s in symbols_of(atom)}))
-                text = to_text(monomial_expr(monomial))
-                return NotApplicable(f"{text} is not a polynomial in {names}")
-            key += [atom] * int(exponent)
-        if len(key) > degree:
-            text = to_text(monomial_expr(monomial))
-            return NotApplicable(f"{text} is of degree {len(key)}, above {degree}")
+        key = [atom for atom, exponent in monomial for _ in range(int(exponent))]
         out[tuple(sorted(key, key=rank.__getitem__))] = coefficient
     if _splits(expression, symbols) and not _holds(expression, separation, symbols):
         names = ", ".join(sorted({s.data[1] for s in symbols_of(expression) & set(symbols)}))
@@ -583,6 +584,19 @@ def polynomial(
             f"logarithms are of positive numbers, whatever the sign of {names}"
         )
     return out
+
+
+def _refusal(monomial: Monomial, rank: dict[Expr, int], degree: int) -> str | None:
+    """Why a term with this monomial is none of a polynomial of the degree; None where it is one."""
+    total = 0
+    for atom, exponent in monomial:
+        if atom not in rank or exponent != int(exponent) or exponent < 0:
+            names = ", ".join(sorted({s.data[1] for s in symbols_of(atom)}))
+            return f"{to_text(monomial_expr(monomial))} is not a polynomial in {names}"
+        total += int(exponent)
+    if total > degree:
+        return f"{to_text(monomial_expr(monomial))} is of degree {total}, above {degree}"
+    return None
 
 
 def _splits(expression: Expr, symbols: Sequence[Expr]) -> bool:

@@ -46,6 +46,7 @@ SIZES = (0.1, 1.0, 30.0, 1e3, 1e6)
 EXACT, LOOSE = 1e-12, 1e-6  # of the summands' sizes: at the near points, and at the wide ones
 MISSED = 1e-6  # a summand is seen where it has this share of all
 MANY = 200  # summands beyond which products are not multiplied out
+MOST = 2000  # products of summands made in all
 _FOLLOWED = {"const", "symbol", "add", "sub", "mul", "div", "neg", "sqrt", "log", "sin", "cos",
              "where", "and", "or", "not", "item", *MATRIX_OPS}  # fmt: skip
 
@@ -173,6 +174,7 @@ def _exponential(exponent: Expr, own: dict[Expr, Expr]) -> Expr:
 def _summands(parts: list[Expr]) -> list[Expr]:
     """Sums taken apart, also in products and numerators; none where that makes too many."""
     found: dict[Expr, list[Expr]] = {}
+    left = MOST
     for node in topological(parts):
         op, own = node.op, [node]
         under = [found[a] for a in node.args]
@@ -184,7 +186,8 @@ def _summands(parts: list[Expr]) -> list[Expr]:
             own = [-p for p in under[0]]
         elif op == "div":
             own = [p / node.args[1] for p in under[0]]
-        elif op == "mul" and 1 < len(under[0]) * len(under[1]) <= MANY:
+        elif op == "mul" and 1 < (size := len(under[0]) * len(under[1])) <= min(MANY, left):
             own = [a * b for a in under[0] for b in under[1]]
+            left -= size
         found[node] = own if len(own) <= MANY else [node]
     return [p for part in parts for p in found[part]]

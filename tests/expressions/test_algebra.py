@@ -6,10 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from ssmppl.errors import NotApplicable
+from ssmppl.expressions import algebra
 from ssmppl.expressions.algebra import Separation, affine, polynomial, quadratic, separate
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import apply, constant, symbol, symbols_of
+from ssmppl.expressions.zero import cancels
 
 PHI, TAU, V = (symbol("parameter", n) for n in ("phi", "tau", "v"))
 X, Y, U = symbol("state_prev", "x"), symbol("state", "y"), symbol("input", "u")
@@ -234,6 +236,22 @@ def test_many_terms_stop_with_a_reason():
     form = separate(product, x)
     assert isinstance(form, NotApplicable)
     assert "terms when multiplied out" in form.reason
+
+
+@pytest.mark.parametrize("steps", [4, 6, 10, 25])
+def test_logistic_maps_in_small_steps_are_refused_soon(steps, monkeypatch):
+    """Of 2^steps terms: refused by the first one of too high a degree, or by their size."""
+    n, made = X, []
+    for _ in range(steps):
+        n = n + 0.1 * V * n * (1 - n)
+    with monkeypatch.context() as patch:
+        patch.setattr(algebra, "cancels", lambda parts: made.append(len(parts)) or cancels(parts))
+        form = polynomial(n, [X], 1)
+    assert isinstance(form, NotApplicable)
+    wanted = "is of degree" if steps < 10 else "when multiplied out"
+    assert wanted in form.reason
+    assert len(made) <= steps
+    assert isinstance(separate(n, [V]), NotApplicable if steps > 6 else Separation)
 
 
 def test_long_sums_separate():

@@ -32,6 +32,7 @@ from ssmppl.language import distributions as laws
 from ssmppl.language.model.trace import Site, Trace
 
 MAX_STATISTICS = 12
+TIDIED = 100  # operations beyond which a coefficient is written as it stands
 MAX_NAMES = 6  # of a block
 MATRIX_LENGTH = 80  # of the text of a matrix or a vector
 ARITHMETIC = frozenset(["add", "sub", "mul", "neg", "const", "symbol"])
@@ -162,14 +163,17 @@ def tidy(coefficient: Expr) -> tuple[float, str]:
     """
     while coefficient.op == "where" and _vanishes_anyway(coefficient):
         coefficient = coefficient.args[2]
+    number, core = split_constant(coefficient)
+    nodes = topological([coefficient])
+    if len(nodes) > TIDIED:
+        return number, shorten(to_text(core))
     opaque = {
         n: symbol("parameter", to_text(n))
-        for n in topological([coefficient])
+        for n in nodes
         if n.op not in ARITHMETIC and not _whole_power(n)
     }
     (plain,) = substitute([coefficient], opaque)
     form = separate(plain, symbols_of(plain))
-    number, core = split_constant(coefficient)
     if isinstance(form, Separation) and 0 < len(form.terms) <= 4:
         pairs = form.items()
         if all(c.op == "const" for _, c in pairs) and all(

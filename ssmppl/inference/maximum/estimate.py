@@ -124,6 +124,8 @@ class Estimate:
         out = []
         if self.attrs.get("approximate"):
             out.append(f"the likelihood is {self.attrs.get('likelihood', 'an approximation')}")
+        if "approximate_laws" in self.attrs:
+            out.append(str(self.attrs["approximate_laws"]))
         if self.attrs.get("interrupted"):
             out.append("interrupted; this is the best point so far")
         elif self.attrs.get("converged") is False:

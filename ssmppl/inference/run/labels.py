@@ -38,6 +38,13 @@ def component_dims(name: str, values: np.ndarray, leading: int) -> list[str]:
     return [f"{name}_dim_{k}" for k in range(values.ndim - leading)]
 
 
+def model_attributes(trace: Trace) -> dict[str, Any]:
+    """The attributes of every result that are about the model: its name, and which of its laws
+    are approximations of what was declared, as that of a non-linear `SDE`."""
+    told = "; ".join(f"{name}: {text}" for name, text in trace.approximations.items())
+    return {"model": trace.name} | ({"approximate_laws": told} if told else {})
+
+
 def observes(trace: Trace) -> dict[str, str]:
     """Components of the observation whose mean, or location, is a component of the state itself:
     `y[0]` to `x`.

@@ -25,7 +25,7 @@ from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, full
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
 from ssmppl.inference.run.executors import check_executor
-from ssmppl.inference.run.labels import component_dims, observes, with_data
+from ssmppl.inference.run.labels import component_dims, model_attributes, observes, with_data
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
@@ -137,7 +137,7 @@ def particle_filter(
     task = partial(_one_run, problem, theta, settings, levels, root, history)
     runs = run_tasks(task, list(range(repeats)), executor=executor)
     attrs = {
-        "model": problem.trace.name, "particles": particles, "proposal": settings.proposal,
+        **model_attributes(problem.trace), "particles": particles, "proposal": settings.proposal,
         "resampling": "multinomial" if rescue else resampling, "ess_threshold": ess_threshold,
         "rescue": rescue, "seed": str(root.entropy),
     }  # fmt: skip
@@ -294,7 +294,7 @@ def kalman_filter(
     levels = quantile_levels(quantiles)
     if proposal == "auto":
         proposal = "extended" if simulators(problem.trace) else "kalman"
-    attrs: dict[str, Any] = {"model": problem.trace.name, "proposal": proposal}
+    attrs: dict[str, Any] = model_attributes(problem.trace) | {"proposal": proposal}
     if proposal in APPROXIMATE:
         attrs["approximate"] = 1
         run_filter = ApproximateKalman(
@@ -391,7 +391,7 @@ def forward_filter(
     exact = hidden_markov(problem.trace)
     assert isinstance(exact, HiddenMarkov)
     levels, root = quantile_levels(quantiles), seed_sequence(seed)
-    attrs = {"model": problem.trace.name, "proposal": "forward", "seed": str(root.entropy)}
+    attrs = model_attributes(problem.trace) | {"proposal": "forward", "seed": str(root.entropy)}
     datasets = []
     each = exact.filter_each(problem.experiments, theta)
     laws = [f.predicted for f in each]

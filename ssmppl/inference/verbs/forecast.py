@@ -28,7 +28,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.maximum.estimate import Estimate
-from ssmppl.inference.run.labels import TIME_ZONES, observes, zone_of
+from ssmppl.inference.run.labels import TIME_ZONES, model_attributes, observes, zone_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.predict import all_draws, group, parameters_of, posterior_of, states_of
@@ -138,7 +138,7 @@ def forecast(
         over_time=set(over_time),
         time=labels,
         attrs={
-            "model": traced.name,
+            **model_attributes(traced),
             "seed": str(root.entropy),
             "after": int(rows),
             "experiment": experiment or 1,

@@ -32,6 +32,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.labels import model_attributes
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
@@ -161,7 +162,7 @@ def leave_future_out(
         },
         time=labels[begin - 1 :],
         attrs={
-            "model": problem.trace.name, "elpd": float(elpd[measured].sum()),
+            **model_attributes(problem.trace), "elpd": float(elpd[measured].sum()),
             "standard_error": spread, "refits": refits, "threshold": threshold,
             "seed": str(root.entropy),
         },

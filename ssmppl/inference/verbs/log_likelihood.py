@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from typing import Any
@@ -24,6 +25,11 @@ from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.model import Model
 
+BY_EXTENDED = (
+    "the model calls a simulator, so that this log-likelihood is an approximation, by the extended "
+    'Kalman filter. proposal="extended" asks for it without this warning; proposal="bootstrap" is '
+    "unbiased"
+)
 TASKS = 8  # pieces that repeats are cut into, so that an executor has something to share out
 
 
@@ -101,6 +107,10 @@ def log_likelihood(
     ------
     ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
     SamplingError : weights are NaN for some particles, naming the step and the user's line.
+
+    Warns
+    -----
+    UserWarning : "auto" took an approximation.
     """
     check_executor(executor)
     problem = pose(model, data)
@@ -116,6 +126,8 @@ def log_likelihood(
         integrate=True, device=device,
     )  # fmt: skip
     if settings.proposal in EXACT:
+        if proposal == "auto" and settings.proposal == "extended":
+            warnings.warn(BY_EXTENDED, stacklevel=2)
         exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
     task = estimates_task(problem, theta, settings, seed_sequence(seed))

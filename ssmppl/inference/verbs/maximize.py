@@ -45,6 +45,7 @@ from ssmppl.inference.preparation.method_choice import choose_maximiser, start_a
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.preparation.space import free_components, space_of
 from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.labels import model_attributes
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
@@ -140,7 +141,7 @@ def maximize(
             setup, chosen, reason = _without_laplace(setup, ascent)
             ascent = METHODS[type(chosen)](setup, chosen)
     attrs: dict[str, Any] = {
-        "model": problem.trace.name,
+        **model_attributes(problem.trace),
         "method": type(chosen).__name__ if chosen is not None else NO_METHOD,
         "method_chosen": reason,
         "objective": objective,

@@ -23,7 +23,7 @@ from ssmppl.data import (
 )
 from ssmppl.data.parameters import pack, pack_states
 from ssmppl.errors import ArgumentError, ModelError, listing
-from ssmppl.inference.run.labels import Labels, check_names, observes
+from ssmppl.inference.run.labels import Labels, check_names, model_attributes, observes
 from ssmppl.inference.run.prior import draw_prior
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.simulate import check_drawable, check_finite, check_samplers, feeds_back
@@ -180,7 +180,7 @@ def predict(
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     labels = Labels(experiments)
     attrs: dict[str, Any] = {
-        "model": traced.name, "seed": str(root.entropy), "observes": observes(traced),
+        **model_attributes(traced), "seed": str(root.entropy), "observes": observes(traced),
     }  # fmt: skip
     if posterior is None:
         return _from_prior(traced, program, experiments, labels, draws, root, attrs)

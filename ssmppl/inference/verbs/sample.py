@@ -40,7 +40,7 @@ from ssmppl.inference.preparation.space import Space, free_components, space_of
 from ssmppl.inference.run.convergence import have_mixed, mixing_attributes
 from ssmppl.inference.run.draws import stack
 from ssmppl.inference.run.executors import check_executor
-from ssmppl.inference.run.labels import Labels, check_names, observes
+from ssmppl.inference.run.labels import Labels, check_names, model_attributes, observes
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.inference.updates.independence import AHEAD, PREPARING
@@ -197,7 +197,7 @@ def sample(
     mixed = partial(have_mixed, free=free) if method is None and patience else None
     result, report = sampling_method.draw(setup, chosen, draws, executor, progress, mixed)
     attrs = {
-        "model": problem.trace.name,
+        **model_attributes(problem.trace),
         "method": type(chosen).__name__,
         "method_chosen": "by the user" if method is not None else "automatically",
         **({"method_reason": reason} if reason else {}),

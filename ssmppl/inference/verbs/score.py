@@ -27,6 +27,7 @@ from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.proposal_choice import resolve_settings
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.labels import model_attributes
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.language.model.model import Model
@@ -142,7 +143,7 @@ def score(
     check_count("trajectories", trajectories, 1)
     settings = resolve_settings(problem, theta, particles, proposal)
     root = seed_sequence(seed)
-    attrs: dict[str, Any] = {"model": problem.trace.name, "fixed": dict(fixed or {})}
+    attrs: dict[str, Any] = model_attributes(problem.trace) | {"fixed": dict(fixed or {})}
     form = exact_model(problem.trace)
     if settings.proposal in EXACT and not isinstance(form, NotApplicable):
         exact = exact_score(form, problem.experiments, free, theta)

@@ -22,6 +22,7 @@ from ssmppl.data import (
 from ssmppl.errors import ModelError, SamplingError
 from ssmppl.expressions.expr import topological
 from ssmppl.inference.run.invalid_laws import out_of_range
+from ssmppl.inference.run.labels import model_attributes
 from ssmppl.inference.run.prior import draw_prior
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.model.model import Model
@@ -98,7 +99,7 @@ def simulate(
         variables,
         over_time=over_time,
         time=source.time,
-        attrs={"model": traced.name, "seed": str(root.entropy)},
+        attrs=model_attributes(traced) | {"seed": str(root.entropy)},
     )
 
 

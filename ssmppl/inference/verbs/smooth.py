@@ -43,7 +43,7 @@ from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolv
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.invalid_laws import total_of
-from ssmppl.inference.run.labels import component_dims, observes, with_data
+from ssmppl.inference.run.labels import component_dims, model_attributes, observes, with_data
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.filters import LEVELS, normal_quantiles, quantile_levels
@@ -380,7 +380,7 @@ def smooth(
     )
     found = METHODS[_kind(chosen) or type(chosen)](setup, chosen)
     attrs = {
-        "model": problem.trace.name, "method": type(chosen).__name__, "method_chosen": why,
+        **model_attributes(problem.trace), "method": type(chosen).__name__, "method_chosen": why,
         "settings": asdict(chosen), "seed": str(root.entropy),
         "seconds": time.perf_counter() - began,
     }  # fmt: skip

@@ -105,6 +105,13 @@ class Trace:
     def state_prev_symbols(self) -> list[Expr]:
         return [previous(s) for s in self.state_symbols]
 
+    @property
+    def approximations(self) -> dict[str, str]:
+        """What a law stands for where it is an approximation, by the name of its quantity."""
+        return {
+            s.name: text for s in self.transition.values() if (text := s.distribution.approximation)
+        }
+
     @cached_property
     def observation_symbols(self) -> list[Expr]:
         return [s for site in self.observations.values() for s in site.components]

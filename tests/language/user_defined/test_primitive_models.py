@@ -70,7 +70,7 @@ def test_scores_and_maxima_are_those_of_the_model_written_out(data):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method", [ssm.MetropolisHastings(order=1), ssm.PGAS(particles=20), ssm.PMMH(particles=30)]
+    "method", [ssm.ISMCMC(particles=30), ssm.PGAS(particles=20), ssm.PMMH(particles=30)]
 )
 def test_posteriors_are_those_of_the_model_written_out(data, method):
     """Means within five standard errors of the difference of two chains with an ESS of 50 each."""

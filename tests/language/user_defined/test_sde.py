@@ -183,6 +183,17 @@ def test_a_nonlinear_sde_is_near_its_law_over_a_short_time():
     assert "approximated" in law.approximation
 
 
+def test_results_say_that_the_law_of_a_nonlinear_sde_is_approximate(record):
+    model = van_der_pol("linearised", 4)
+    drawn = ssm.simulate(model, {}, steps=5, seed=1)
+    assert "x: the law of an SDE, approximated by its lin" in drawn.attrs["approximate_laws"]
+    filtered = ssm.particle_filter(model, {"y": drawn["y"].values[0]}, {}, particles=20, seed=1)
+    assert filtered.attrs["approximate_laws"] == drawn.attrs["approximate_laws"]
+    time, y = record
+    exact = ssm.kalman_filter(oscillator(), {"y": y, "time": time}, {"k": 4.0, "d": 0.6})
+    assert "approximate_laws" not in exact.attrs
+
+
 def test_loops_are_told_by_name():
     model = ssm.Model("loops", inputs=("n",))
 

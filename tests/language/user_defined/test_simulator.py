@@ -2,6 +2,7 @@
 
 import pickle
 import threading
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
@@ -64,6 +65,14 @@ def called(function):
     """The values at three points, by a simulator of this function."""
     own = ssm.simulator(state=["q", "v"], inputs=["u"], parameters=["k"])(function)
     return own(q=np.array([0.1, -0.4, 2.0]), v=0.3, u=1.0, k=1.3).vector
+
+
+def test_that_the_automatic_likelihood_is_approximate_is_told():
+    with pytest.warns(UserWarning, match="an approximation, by the extended Kalman filter"):
+        told = ssm.log_likelihood(model_of(step), DATA, AT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert ssm.log_likelihood(model_of(step), DATA, AT, proposal="extended") == told
 
 
 class TestCalls:
