@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.structure import component_means, deterministic
@@ -92,7 +93,7 @@ class CompleteScore:
 
     def involved(self, parameter: Expr) -> list[Expr]:
         """The symbols that change with a parameter when the noisy components do not."""
-        own = [s for s, p in self.moving if p is parameter]
+        own = self._moved_by.get(parameter, [])
         return [parameter, *own, *(previous(s) for s in own)]
 
     def obstacle(self, parameter: Expr) -> NotApplicable | None:
@@ -135,7 +136,7 @@ class CompleteScore:
         return Sums(
             {r: [self._derive(d, p) for p in self.parameters] for r, d in self.density.items()},
             self._follow(self._first_values()),
-            [_column(s, (p,)) for s, p in self._ordered()],
+            [_column(s, (p,)) for s, p in self._ordered],
         )
 
     def hessian(self) -> Sums:
@@ -152,21 +153,30 @@ class CompleteScore:
             for i, p in enumerate(self.parameters):
                 slope = self._derive(density, p)
                 parts[role] += [self._derive(slope, q) for q in self.parameters[: i + 1]]
-        columns = [_column(s, (p,)) for s, p in self._ordered()]
+        columns = [_column(s, (p,)) for s, p in self._ordered]
         columns += [_column(s, ps) for s, ps in sorted(self._second, key=repr)]
         return Sums(parts, self._follow(first | second), columns)
 
+    @cached_property
     def _ordered(self) -> list[tuple[Expr, Expr]]:
         return sorted(self.moving, key=repr)
+
+    @cached_property
+    def _moved_by(self) -> dict[Expr, list[Expr]]:
+        """Parameter -> the deterministic components that change with it, in order."""
+        out: dict[Expr, list[Expr]] = {}
+        for s, p in self._ordered:
+            out.setdefault(p, []).append(s)
+        return out
 
     def _derive(self, expression: Expr, parameter: Expr) -> Expr:
         """The total derivative, through what is deterministic."""
         inside = symbols_of(expression)
         total = differentiate([expression], parameter)[0]
         rates: dict[Expr, Expr] = {}
-        for s, p in self._ordered():
-            if p is parameter:
-                rates[s] = _column(s, (p,))
+        for s in self._moved_by.get(parameter, ()):
+            rates[s] = _column(s, (parameter,))
+        for s, p in self._ordered if self._second else ():
             pair = tuple(sorted((p, parameter), key=repr))
             if (s, pair) in self._second:
                 rates[_column(s, (p,))] = _column(s, pair)
@@ -184,14 +194,14 @@ class CompleteScore:
                 role: self._derive(values[s], p) if s in values else zero
                 for role, values in self.value.items()
             }
-            for s, p in self._ordered()
+            for s, p in self._ordered
         }
 
     def _second_values(self, first: dict[Expr, dict[str, Expr]]) -> dict[Expr, dict[str, Expr]]:
         """column -> role -> value, for those second derivatives that are not zero throughout."""
         while True:
             values = {}
-            for s, p in self._ordered():
+            for s, p in self._ordered:
                 for q in (q for q in self.parameters if (s, q) in self.moving):
                     pair = tuple(sorted((p, q), key=repr))
                     own = {r: self._derive(e, q) for r, e in first[_column(s, (p,))].items()}

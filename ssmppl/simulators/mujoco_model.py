@@ -145,7 +145,7 @@ class MujocoModel:
         self._control = np.array([first[c] for c in given.values()], dtype=int)
         own = {n: (n,) for n in joints}
         pushed = chosen(forces, own, "forces", self.file, lambda n: f"{identifier(n)}_force")
-        self.forces = tuple(pushed)
+        self.forces = {name: f"{identifier(n)}_velocity" for name, n in pushed.items()}
         self._force = np.array(
             [self.model.jnt_dofadr[joints[n]] for n in pushed.values()], dtype=int
         )

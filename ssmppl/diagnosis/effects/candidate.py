@@ -53,6 +53,8 @@ class Candidate:
     held : its process is held at 1: see `increment`.
     reaction : (label, factor) of each equation that moves with its own, by so many times as much
         (`shared_terms`). carried : likewise of what integrates its new value.
+    force : the argument of a simulator through which it acts, in whose unit its strength is; "" for
+        an increment of the equation itself.
     shares : candidates of the same text here have the same shapes, which then are one parameter.
     """
 
@@ -66,6 +68,7 @@ class Candidate:
     shares: str = ""
     reaction: tuple[tuple[str, Expr], ...] = ()
     carried: tuple[tuple[str, Expr], ...] = ()
+    force: str = ""
 
     @property
     def kind(self) -> str:
@@ -78,6 +81,7 @@ class Candidate:
         free = [a for a, role in self.effect.given.items() if role in ("other state", "any input")]
         others = [label for a, label in self.bound if a in free]
         parts = [self.effect.form, *(f"by {label}" for label in others)]
+        parts += [f"through {self.force}"] if self.force else []
         if self.reaction:
             parts.append(f"with {' and '.join(label for label, _ in self.reaction)}")
         return ", ".join(filter(None, parts))

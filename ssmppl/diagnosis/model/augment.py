@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from ssmppl.analysis.new_values import in_order
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.binding import bind
 from ssmppl.diagnosis.model.candidates import slug
@@ -28,6 +29,7 @@ from ssmppl.diagnosis.model.changed_laws import (
     substituted,
 )
 from ssmppl.diagnosis.model.equations import Augmented, Equations, Part, as_it_was
+from ssmppl.diagnosis.model.forces import Force, linear, with_forces
 from ssmppl.errors import ArgumentError, Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed
@@ -39,7 +41,9 @@ _LAWS = {"transition": shifted, "observation": shifted, "initial": shifted, "noi
          "tail": heavier}  # fmt: skip
 
 
-def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True) -> Trace:
+def augment(
+    trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True, first_order: bool = False
+) -> Trace:
     """The model with the effects added, as an `Augmented` one.
 
     Parameters
@@ -48,6 +52,8 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
     candidates : their strengths become scalar parameters, in this order behind the model's own.
     prior : whether they get a prior: Flat, HalfFlat where the strength is at least 0, Uniform
         between two bounds. False leaves them as symbols that no site declares, for derivatives.
+    first_order : what acts by a simulator's force only has to have the right score at strength 0
+        (`forces.linear`).
 
     Raises
     ------
@@ -70,17 +76,23 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
     equations = Equations(new, equations)
     for c in late:
         names[c.strength] = auxiliary.add(c, equations, locations)
-    new = _moved(new, late, equations, names, locations)
+    forced = [c for c in late if c.force]
+    pushes = _pushes(forced, equations, names, locations)
+    if forced:  # before means are moved, which then are no more than what the simulator gives
+        new = linear(new, pushes) if first_order else with_forces(new, pushes)
+    new = _moved(new, [c for c in late if not c.force], equations, names, locations)
     parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:
         if prior:
             with attributed(locations, c.effect.where):
                 parameters[c.strength] = _prior_site(c)
+    transition = in_order(_in_order(trace.transition, {**new.transition, **auxiliary.transition}))
+    assert transition is not None, new.transition  # none reads itself
     return Augmented(
         name=trace.name,
         parameters=parameters,
         initial=_in_order(trace.initial, {**new.initial, **auxiliary.initial}),
-        transition=_in_order(trace.transition, {**new.transition, **auxiliary.transition}),
+        transition=transition,
         observations=new.observations,
         proposal={**new.proposal, **auxiliary.transition} if new.proposal else {},
         inputs=trace.inputs,
@@ -276,6 +288,21 @@ def _moved(
         groups[role] = new
     return replace(trace, initial=groups["initial"], transition=groups["transition"],
                    observations=groups["observation"])  # fmt: skip
+
+
+def _pushes(
+    candidates: Sequence[Candidate], equations: Equations, names: Mapping[str, dict[str, str]],
+    locations: dict[Expr, Location],
+) -> list[tuple[Force, Expr]]:  # fmt: skip
+    """The increments of simulators' forces."""
+    out = []
+    for c in candidates:
+        force = equations.force(equations.parts[c.equation])
+        assert force is not None, c
+        with attributed(locations, c.effect.where):
+            (by,) = bind(c, equations, "transition", names[c.strength]).changes.values()
+        out.append((force, by))
+    return out
 
 
 def _role(c: Candidate, part: Part) -> str:

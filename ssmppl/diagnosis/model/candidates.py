@@ -145,6 +145,9 @@ def _of_effect(
                 continue
             made = [Candidate(effect, part.label, shape, bound, part.role) for shape in shapes]
             moves = made[0].change == "transition" and effect.profile not in DATED
+            force = equations.force(part) if made[0].change == "transition" else None
+            if force and len(bind(made[0], equations, "transition", own=True).changes) == 1:
+                made, moves = [replace(c, force=force.name) for c in made], False
             if moves and part.label in shared.carried:
                 made = [replace(c, carried=shared.carried[part.label]) for c in made]
             reason = _check(made[0], equations)

@@ -22,7 +22,8 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.changed_laws import Index, noise_free, scale_of_mean
-from ssmppl.errors import NotApplicable
+from ssmppl.diagnosis.model.forces import Force, force_on
+from ssmppl.errors import NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.evaluate import evaluate
@@ -36,6 +37,7 @@ from ssmppl.expressions.expr import (
     topological,
 )
 from ssmppl.expressions.node import SEVERAL
+from ssmppl.inference.preparation.initial_values import ordinary_values
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.trace import Trace, previous, symbols
 
@@ -168,6 +170,10 @@ class Equations:
         found = [p for p, v in self.integral_of.items() if v == part.label]
         return self.parts[found[0]] if found else None
 
+    def force(self, part: Part) -> Force | None:
+        """The simulator's force that acts on a state; None where it has none."""
+        return force_on(self.mean(part)) if part.role == "state" else None
+
     def fixed_by_others(self, part: Part) -> str:
         """Why a state is no rate: what its transition does instead; "" where it is one."""
         if part.label in self.integral_of:
@@ -221,7 +227,8 @@ class Equations:
         states = [p for p in self.of_role("state") if isinstance(self.step(p), Expr)]
         steps = {p.label: self.step(p) for p in states}
         rng = np.random.default_rng(1)
-        samples = [_values(self.trace, steps, rng) for _ in range(3)]
+        ordinary = _ordinary(self.trace) if any(map(_in_small_steps, steps.values())) else {}
+        samples = [_values(self.trace, steps, rng, ordinary) for _ in range(3)]
         out: dict[str, str] = {}
         for p in states:
             if p.label in self.copies:
@@ -235,13 +242,34 @@ class Equations:
         return out
 
 
-def _values(trace: Trace, steps: dict[str, Any], rng: Any) -> dict[str, tuple[Any, Any]]:
-    """Values and steps of the states at random points; inputs and time the same at all of them."""
+def _ordinary(trace: Trace) -> dict[Expr, float]:
+    """An ordinary value of each parameter: small steps are small where a damping is not of any
+    size."""
+    try:
+        values = ordinary_values(trace, {}, {})
+    except SSMError:
+        return {}
+    return {
+        s: float(v)
+        for name, site in trace.parameters.items()
+        for s, v in zip(site.components, np.ravel(values[name]), strict=True)
+    }
+
+
+def _values(
+    trace: Trace, steps: dict[str, Any], rng: Any, ordinary: Mapping[Expr, float]
+) -> dict[str, tuple[Any, Any]]:
+    """Values and steps of the states at random points; inputs and time the same at all of them.
+
+    ordinary : values of parameters, round which these are drawn.
+    """
     roots = list(steps.values())
     known = {}
     for s in symbols_of(roots):
         fixed = s.data[0] in ("input_prev", "time_prev")
         known[s] = rng.uniform(0.3, 1.5, None if fixed else _POINTS)
+        if s in ordinary:
+            known[s] = ordinary[s] * rng.uniform(0.7, 1.4, _POINTS)
     for s in trace.state_prev_symbols:
         known.setdefault(s, rng.uniform(0.3, 1.5, _POINTS))
     moved = evaluate(roots, known)

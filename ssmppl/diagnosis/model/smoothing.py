@@ -36,6 +36,7 @@ from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import Expr
+from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
 from ssmppl.inference.particles.backward import ParticleSystem, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
@@ -47,11 +48,13 @@ from ssmppl.language.model.trace import Site, Trace, symbols
 # Of a pass.
 LAG = 40  # rows of the fixed-lag smoother
 DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
+CALLED = 4  # trajectories where a simulator is called, mirrored too
 PREDICTIVE = 128  # draws behind a prediction under the twisted proposal
 
 # Of predictions further ahead.
 HORIZONS = (1, 10, 100)  # rows
 ORIGINS = 40  # rows that are simulated on from, spread evenly
+ORIGINS_CALLED = 16  # likewise, where a simulator is called
 CRPS_DRAWS = 24  # from each
 FEWEST = 8  # of these rows, without which a horizon is left out (0 in every data set)
 
@@ -112,6 +115,11 @@ class Smoother:
         return kalman_model(self.columns.base)
 
     @once_property
+    def extended(self) -> Extended | NotApplicable:
+        """Of a model that calls a simulator, for which many particles take long."""
+        return extended_model(self.columns.base)
+
+    @once_property
     def problem(self) -> Problem:
         return Problem(self.columns.base, (), self.program)
 
@@ -147,9 +155,14 @@ class Smoother:
             # Antithetic: scores that are linear in the states come out exact.
             paths = self.kalman.draw(e, own, stream, DRAWS // 2)
             paths = np.concatenate([paths, 2.0 * self.kalman.smooth(e, own).mean - paths])
-            found = np.moveaxis(paths, 0, 2)
-            weights = np.full((e.steps, DRAWS), 1.0 / DRAWS)
-            ancestors = np.broadcast_to(np.arange(DRAWS, dtype=np.int32), weights.shape).copy()
+            found, weights, ancestors = _as_particles(paths)
+        elif isinstance(self.extended, Extended):
+            filtered, paths = self.extended.mirrored(e, own, stream, CALLED)
+            found, weights, ancestors = _as_particles(paths)
+            increments = filtered.increments
+            if predicted:
+                known = _drawn(filtered.mean, filtered.covariance, stream)
+                self.module.row_predictions(given, *data, *known, stream, prediction)
         else:
             system, weights = self.system(e, own, stream)
             found, ancestors, increments = system.particles, system.ancestors, system.log_increments
@@ -164,7 +177,8 @@ class Smoother:
         scores = None
         if ahead and known is not None:
             feedback = feeds_back(self.columns.base)
-            scores = crps_ahead(self.program, e, own, *known, stream, feedback)
+            origins = ORIGINS_CALLED if isinstance(self.extended, Extended) else ORIGINS
+            scores = crps_ahead(self.program, e, own, *known, stream, feedback, origins)
         return Pass(increments, rows, prediction, scores, together)
 
     def system(
@@ -204,6 +218,13 @@ class Smoother:
         found = self.program.gaussian
         assert isinstance(found, GaussianApproximation)
         return found
+
+
+def _as_particles(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Paths (N, T, D) as particles (T, D, N) with weights (T, N) and ancestors (T, N)."""
+    n, steps = paths.shape[:2]
+    ancestors = np.broadcast_to(np.arange(n, dtype=np.int32), (steps, n)).copy()
+    return np.moveaxis(paths, 0, 2), np.full((steps, n), 1.0 / n), ancestors
 
 
 def _drawn(
@@ -270,16 +291,16 @@ def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
 
 def crps_ahead(
     program: Program, e: Experiment, theta: np.ndarray, particles: np.ndarray, weights: np.ndarray,
-    stream: np.ndarray, feedback: bool, horizons: Sequence[int] = HORIZONS,
+    stream: np.ndarray, feedback: bool, most: int = ORIGINS, horizons: Sequence[int] = HORIZONS,
 ) -> np.ndarray:  # fmt: skip
-    """(O, H, K) CRPS of each channel at each horizon, from O rows on; NaN where nothing was
-    observed, or the record ends before.
+    """(O, H, K) CRPS of each channel at each horizon, from O rows (`most`) on; NaN where nothing
+    was observed, or the record ends before.
 
     particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : a transition names
     observations; rows that lack one are then not simulated on from.
     """
     simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
-    origins = np.unique(np.linspace(0, max(steps - 2, 0), ORIGINS).astype(int))
+    origins = np.unique(np.linspace(0, max(steps - 2, 0), most).astype(int))
     if steps < 2:
         return np.full((len(origins), len(horizons), channels), np.nan)
     levels = np.empty(1)

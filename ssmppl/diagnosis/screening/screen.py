@@ -275,7 +275,7 @@ def _columns(
 ) -> tuple[ScoreExpressions, dict[str, float]]:
     """The score columns of the model with all candidates, and the values of their shapes."""
     made, shapes = symbolic_shapes(candidates)
-    superset = with_given_parameters(augment(trace, made), shapes)
+    superset = with_given_parameters(augment(trace, made, first_order=True), shapes)
     names = [c.strength for c in made]
     return score_columns(trace, superset, names, held, missing), dict(shapes)
 

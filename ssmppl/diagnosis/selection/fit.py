@@ -38,7 +38,7 @@ from ssmppl.diagnosis.selection.densities import best_of_many, densities_of, den
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.batched.extended import extended_model
+from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
@@ -484,6 +484,8 @@ class Fitter:
         """(T, draws, D) draws of each x_t: of trajectories where exact, else filtered."""
         if isinstance(self.kalman, KalmanModel):
             return np.swapaxes(self.kalman.draw(e, theta, stream, draws), 0, 1)
+        if isinstance(self.smoother.extended, Extended):
+            return np.swapaxes(self.smoother.extended.draw(e, theta, stream, draws), 0, 1)
         system, weights = self.smoother.system(e, theta, stream)
         cumulative = np.cumsum(weights, axis=1)
         levels = (np.arange(draws) + 0.5) / draws

@@ -63,12 +63,23 @@ class Stencil:
         return cls(tuple(wanted), shifts, place)
 
     def derivatives(
-        self, function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, scales: np.ndarray
-    ) -> np.ndarray:
-        """(len(wanted), outputs, B) at x (B, K) of a function (P, K) -> (P, outputs)."""
+        self, function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, scales: np.ndarray,
+        known: dict[tuple[float, Index], np.ndarray] | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """(len(wanted), outputs, B) at x (B, K) of a function (P, K) -> (P, outputs).
+
+        known : place -> the function's values (B, outputs) there, where other derivatives at x
+            have asked for them; takes those that are new.
+        """
         size, k = x.shape
         points = x + self.shifts * np.maximum(np.abs(x), scales)
-        values = function(points.reshape(-1, k)).reshape(len(self.shifts), size, -1)
+        known = {} if known is None else known
+        new = {at: p for at, p in self.place.items() if at not in known}
+        if new:
+            asked = points if len(new) == len(points) else points[list(new.values())]
+            found = function(asked.reshape(-1, k)).reshape(len(new), size, -1)
+            known |= dict(zip(new, found, strict=True))
+        values = np.stack([known[at] for at in self.place])
         out = np.empty((len(self.wanted), values.shape[2], size))
         for w, index in enumerate(self.wanted):
             if not index:

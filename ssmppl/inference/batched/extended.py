@@ -15,7 +15,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import simulators
-from ssmppl.codegen.modules.gaussian import GaussianApproximation
+from ssmppl.codegen.modules.gaussian import FilterMoments, GaussianApproximation
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
@@ -98,9 +98,23 @@ class Extended(Scored):
         self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 1
     ) -> np.ndarray:
         """Draws (draws, T, D) of x_{1:T} given y_{1:T}, by backward sampling; `stream` moves on."""
-        rng = np.random.default_rng([int(word) for word in stream])
-        stream[:] = rng.integers(1, 2**63, len(stream), dtype=np.uint64)
-        return self._kalman(experiment).draw(experiment, theta, rng, draws)[1]
+        return self._kalman(experiment).draw(experiment, theta, _advanced(stream), draws)[1]
+
+    def mirrored(
+        self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int
+    ) -> tuple[FilterMoments, np.ndarray]:
+        """The filter's moments, and draws as of `draw`, half of them mirrored at the smoothed
+        mean, from one pass of the filter.
+
+        Raises
+        ------
+        SamplingError : they come to no number.
+        """
+        kalman = self._kalman(experiment)
+        found = kalman.filtered(experiment, theta)
+        _, drawn = kalman.draw(experiment, theta, _advanced(stream), draws // 2, found)
+        mean = kalman.smooth(experiment, theta, found).mean
+        return found, np.concatenate([drawn, 2.0 * mean - drawn])
 
     def score(
         self, experiments: Iterable[Experiment], theta: np.ndarray, free: np.ndarray | None = None
@@ -235,6 +249,13 @@ class Extended(Scored):
     def _kalman(self, e: Experiment) -> ApproximateKalman:
         problem = Problem(self.trace, (e,), compile_trace(self.trace, missing_of([e])))
         return ApproximateKalman(problem, self._approximation([e]), "extended")
+
+
+def _advanced(stream: np.ndarray) -> np.random.Generator:
+    """A generator that the stream's state seeds; the stream moves on."""
+    rng = np.random.default_rng([int(word) for word in stream])
+    stream[:] = rng.integers(1, 2**63, len(stream), dtype=np.uint64)
+    return rng
 
 
 def _pseudoinverse(covariance: np.ndarray) -> np.ndarray:

@@ -66,8 +66,10 @@ class ApproximateKalman:
             moments.predicted_covariance, y_mean, y_covariance,
         )  # fmt: skip
 
-    def smooth(self, e: Experiment, theta: np.ndarray) -> SmoothedMoments:
-        """Moments given all data at theta (P,), of one experiment.
+    def smooth(
+        self, e: Experiment, theta: np.ndarray, filtered: FilterMoments | None = None
+    ) -> SmoothedMoments:
+        """Moments given all data at theta (P,), of one experiment; `filtered` where known.
 
         Raises
         ------
@@ -77,7 +79,7 @@ class ApproximateKalman:
             mode = self._mode(e, theta)
             covariance, cross = self.approximation.laplace_moments(mode)
             return SmoothedMoments(mode.x, covariance, cross, mode.log_likelihood)
-        found = self._filtered(e, theta)
+        found = filtered or self.filtered(e, theta)
         mean, covariance = found.mean.copy(), found.covariance.copy()
         cross = np.zeros_like(covariance)
         gains = _gains(found)
@@ -90,9 +92,11 @@ class ApproximateKalman:
         return SmoothedMoments(mean, covariance, cross, float(np.sum(found.increments)))
 
     def draw(
-        self, e: Experiment, theta: np.ndarray, rng: np.random.Generator, draws: int
-    ) -> tuple[float, np.ndarray]:
-        """The log-likelihood, and draws (draws, T, D) of the trajectory, of one experiment.
+        self, e: Experiment, theta: np.ndarray, rng: np.random.Generator, draws: int,
+        filtered: FilterMoments | None = None,
+    ) -> tuple[float, np.ndarray]:  # fmt: skip
+        """The log-likelihood, and draws (draws, T, D) of the trajectory, of one experiment;
+        `filtered` where known.
 
         Raises
         ------
@@ -113,7 +117,7 @@ class ApproximateKalman:
                 off = noise @ mode.spread[t, :, :n].T + (off @ mode.jacobian[t].T if t else 0.0)
                 out[:, t] = mode.x[t] + off
             return mode.log_likelihood, out
-        found = self._filtered(e, theta)
+        found = filtered or self.filtered(e, theta)
         gains = _gains(found)
         for t in range(steps - 1, -1, -1):
             mean, covariance = found.mean[t][None], found.covariance[t]
@@ -124,7 +128,13 @@ class ApproximateKalman:
             out[:, t] = mean + rng.standard_normal((draws, d)) @ _root(covariance).T
         return float(np.sum(found.increments)), out
 
-    def _filtered(self, e: Experiment, theta: np.ndarray) -> FilterMoments:
+    def filtered(self, e: Experiment, theta: np.ndarray) -> FilterMoments:
+        """The filter's moments, of "extended" and "unscented".
+
+        Raises
+        ------
+        SamplingError : they come to no number.
+        """
         if self.kind == "extended":
             return self._extended(e, theta)
         found = self.approximation.unscented(theta, e.y, e.seen, e.u)

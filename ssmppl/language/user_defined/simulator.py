@@ -73,7 +73,8 @@ class Simulator:
     state, inputs, parameters : names of the columns of what `step` takes.
     output : the user's function of what sensors show; None where there is none.
     outputs : names of the columns of what `output` gives.
-    forces : those of the inputs that are generalised forces; 0 where a call leaves them out.
+    forces : those of the inputs that are generalised forces -> the state whose rate of change each
+        acts on, "" where that is not said; 0 where a call leaves them out.
     name : shown in messages.
     scales : by name, of what moves by amounts far from 1.
     where : it was written.
@@ -83,12 +84,12 @@ class Simulator:
     def __init__(
         self, step: Call, *, state: Sequence[str], inputs: Sequence[str],
         parameters: Sequence[str], output: Call | None, outputs: Sequence[str],
-        forces: Sequence[str], name: str, scales: Mapping[str, float], where: Location | None,
+        forces: Mapping[str, str], name: str, scales: Mapping[str, float], where: Location | None,
         token: str = "",
     ):  # fmt: skip
         self.step, self.output, self.name = step, output, name
         self.state, self.inputs, self.parameters = tuple(state), tuple(inputs), tuple(parameters)
-        self.outputs, self.forces, self.scales = tuple(outputs), tuple(forces), dict(scales)
+        self.outputs, self.forces, self.scales = tuple(outputs), dict(forces), dict(scales)
         self.location, self._token = where, token or uuid.uuid4().hex
         self.__name__ = name
         self.__doc__ = getattr(step, "__doc__", None)
@@ -262,7 +263,7 @@ def _row(given: Sequence[Any]) -> Expr:
 
 def simulator(
     *, state: Names, inputs: Names = (), parameters: Names = (), output: Call | None = None,
-    outputs: Names = (), forces: Names = (), name: str | None = None,
+    outputs: Names = (), forces: Names | Mapping[str, str] = (), name: str | None = None,
     scales: Mapping[str, float] | None = None,
 ) -> Callable[[Call], Simulator]:  # fmt: skip
     """Make a function of Python that moves a batch callable inside a model's laws.
@@ -279,8 +280,10 @@ def simulator(
     state, inputs, parameters : names of the columns.
     output, outputs : `output(state, inputs, parameters) -> (B, k)`, sensors at a state, and the
         names of its columns; `step.sense(...)` calls it, in the mean of an observation.
-    forces : names among the inputs that are generalised forces, in the unit of the state's
-        acceleration times its inertia; a call may leave them out, as 0.
+    forces : names among the inputs that are generalised forces, or a mapping of these to the
+        velocity among the states that each accelerates, `{"push": "v"}`; a call may leave them
+        out, as 0. `ssm.diagnose` lets what is missing in that velocity act through the force, in
+        its unit, so that it moves all that the force does.
     name : for messages; by default the function's.
     scales : name -> the size at which an argument matters, 1 by default. Central differences take
         steps of 6e-6 (first derivatives) and 1.2e-4 (second) of it or of the argument's absolute
@@ -312,9 +315,10 @@ def simulator(
     columns = {
         "state": _names(state, "state"), "inputs": _names(inputs, "inputs"),
         "parameters": _names(parameters, "parameters"), "outputs": _names(outputs, "outputs"),
-        "forces": _names(forces, "forces"),
+        "forces": _names(tuple(forces) if isinstance(forces, Mapping) else forces, "forces"),
     }  # fmt: skip
-    _check(columns, output, scales or {})
+    acting = dict(forces) if isinstance(forces, Mapping) else dict.fromkeys(columns["forces"], "")
+    _check(columns, output, scales or {}, acting)
 
     def decorate(step: Call) -> Simulator:
         if not callable(step):
@@ -328,7 +332,7 @@ def simulator(
         return Simulator(
             step, state=columns["state"], inputs=columns["inputs"],
             parameters=columns["parameters"], output=output, outputs=columns["outputs"],
-            forces=columns["forces"], name=title, scales=dict(scales or {}), where=where,
+            forces=acting, name=title, scales=dict(scales or {}), where=where,
         )  # fmt: skip
 
     return decorate
@@ -345,8 +349,9 @@ def _names(given: Names, what: str) -> tuple[str, ...]:
 
 
 def _check(
-    columns: Mapping[str, tuple[str, ...]], output: Call | None, scales: Mapping[str, float]
-) -> None:
+    columns: Mapping[str, tuple[str, ...]], output: Call | None, scales: Mapping[str, float],
+    acting: Mapping[str, str],
+) -> None:  # fmt: skip
     def wrong(found: str, fix: str) -> ModelError:
         return ModelError(f"ssm.simulator: {found}", fix=fix, where=user_location())
 
@@ -365,6 +370,9 @@ def _check(
         if n not in columns["inputs"]:
             known = ", ".join(columns["inputs"]) or "none"
             raise wrong(f"the force {n!r} is no input", f"its inputs are: {known}")
+        if acting[n] and acting[n] not in columns["state"]:
+            known = ", ".join(nearest_first(acting[n], columns["state"]))
+            raise wrong(f"the force {n!r} acts on {acting[n]!r}", f"its states are: {known}")
     for n, size in scales.items():
         if n not in arguments:
             raise wrong(f"scales has {n!r}", f"use: {', '.join(nearest_first(n, arguments))}")
