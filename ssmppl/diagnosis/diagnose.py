@@ -8,12 +8,13 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
@@ -160,7 +161,11 @@ class _Diagnosis:
             "sets": SETS[mode],
         }  # fmt: skip
         made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
-        self.checkpoint = Checkpoint(checkpoint, made_from, executor, progress, failures)
+        # Threads that wait for one simulator take turns, which takes longer than one alone.
+        self.own = ThreadPoolExecutor(1) if executor is None and simulators(self.trace) else None
+        self.checkpoint = Checkpoint(
+            checkpoint, made_from, executor or self.own, progress, failures
+        )
 
     def run(self) -> GapReport:
         """All stages, and the report; after an interrupt, of those that are done."""
@@ -184,6 +189,8 @@ class _Diagnosis:
             ) from error
         finally:
             self.checkpoint.flush()
+            if self.own is not None:
+                self.own.shutdown()
 
     # -- stages
     def _screen(self) -> Results:

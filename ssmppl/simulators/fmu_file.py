@@ -372,7 +372,8 @@ def _restored(path: str, options: dict[str, Any]) -> FMUModel:
 
 def fmu(
     path: str | os.PathLike[str], *, dt: float, state: Any = None, inputs: Chosen = None,
-    parameters: Chosen = None, outputs: Chosen = None, forces: str | Sequence[str] = (),
+    parameters: Chosen = None, outputs: Chosen = None,
+    forces: str | Sequence[str] | Mapping[str, str] = (),
     start: Mapping[str, Any] | None = None, time: str | None = None, substeps: int = 1,
     tolerance: float | None = None, name: str | None = None,
     scales: Mapping[str, float] | None = None,
@@ -395,7 +396,8 @@ def fmu(
     parameters : variables that are parameters, or a mapping; by default none: the others keep the
         file's values.
     outputs : as the inputs.
-    forces : names among the inputs that are generalised forces, 0 where a call leaves them out.
+    forces : names among the inputs that are generalised forces, 0 where a call leaves them out, or
+        a mapping of these to the velocity that each accelerates, `{"push": "v"}`.
     start : variable -> a fixed value of any type instead of the file's.
     time : name of a further input, the unit's time at the beginning of a call; needed where it
         depends on the time. By default each call begins at 0.

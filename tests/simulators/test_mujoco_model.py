@@ -111,7 +111,7 @@ def pendulum():
 def test_names_are_those_of_the_file(pendulum):
     assert pendulum.state == ("pivot", "pivot_velocity")
     assert pendulum.inputs == ("motor", "pivot_force")
-    assert pendulum.forces == ("pivot_force",)
+    assert pendulum.forces == {"pivot_force": "pivot_velocity"}
     assert pendulum.outputs == ("angle", "tip_0", "tip_1", "tip_2")
     assert pendulum.step.values == {"damping": 0.3, "m": 0.7}
     assert (pendulum.step.substeps, pendulum.step.interval) == (50, pytest.approx(0.1))
@@ -277,7 +277,7 @@ def test_mappings_choose_and_rename():
         PENDULUM, controls={"u": "motor"}, forces={"friction": "pivot"}, sensors={"x": "tip_0"},
         substeps=2,
     )  # fmt: skip
-    assert (simulator.inputs, simulator.forces, simulator.outputs) == (
+    assert (simulator.inputs, tuple(simulator.forces), simulator.outputs) == (
         ("u", "friction"), ("friction",), ("x",),
     )  # fmt: skip
     none = mujoco(PENDULUM, controls=(), forces=(), sensors=())

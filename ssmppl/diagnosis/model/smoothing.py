@@ -50,11 +50,12 @@ LAG = 40  # rows of the fixed-lag smoother
 DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
 CALLED = 4  # trajectories where a simulator is called, mirrored too
 PREDICTIVE = 128  # draws behind a prediction under the twisted proposal
+PREDICTIVE_CALLED = 32  # likewise, where a simulator is called
 
 # Of predictions further ahead.
 HORIZONS = (1, 10, 100)  # rows
 ORIGINS = 40  # rows that are simulated on from, spread evenly
-ORIGINS_CALLED = 16  # likewise, where a simulator is called
+ORIGINS_CALLED = 8  # likewise, where a simulator is called; all far enough from the end
 CRPS_DRAWS = 24  # from each
 FEWEST = 8  # of these rows, without which a horizon is left out (0 in every data set)
 
@@ -161,7 +162,7 @@ class Smoother:
             found, weights, ancestors = _as_particles(paths)
             increments = filtered.increments
             if predicted:
-                known = _drawn(filtered.mean, filtered.covariance, stream)
+                known = _drawn(filtered.mean, filtered.covariance, stream, PREDICTIVE_CALLED)
                 self.module.row_predictions(given, *data, *known, stream, prediction)
         else:
             system, weights = self.system(e, own, stream)
@@ -177,7 +178,10 @@ class Smoother:
         scores = None
         if ahead and known is not None:
             feedback = feeds_back(self.columns.base)
-            origins = ORIGINS_CALLED if isinstance(self.extended, Extended) else ORIGINS
+            origins = spread_evenly(e.steps - 2, ORIGINS)
+            if isinstance(self.extended, Extended):
+                last = max(e.steps - 1 - max(HORIZONS), e.steps // 2)
+                origins = spread_evenly(min(last, e.steps - 2), ORIGINS_CALLED)
             scores = crps_ahead(self.program, e, own, *known, stream, feedback, origins)
         return Pass(increments, rows, prediction, scores, together)
 
@@ -228,18 +232,18 @@ def _as_particles(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _drawn(
-    mean: np.ndarray, covariance: np.ndarray, stream: np.ndarray
+    mean: np.ndarray, covariance: np.ndarray, stream: np.ndarray, n: int = PREDICTIVE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Particles (T, D, N), in pairs mirrored at the mean, and weights (T, N) of normal laws with
     these moments (T, D), (T, D, D)."""
     # Rows before a flat start is known have none: what is drawn there is NaN, as their mean is.
     values, vectors = np.linalg.eigh(np.where(np.isfinite(covariance), covariance, 0.0))
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    normals = np.empty(mean.size * (PREDICTIVE // 2))
+    normals = np.empty(mean.size * (n // 2))
     fill_normal(stream, normals)
     away = root @ normals.reshape(*mean.shape, -1)
     drawn = mean[:, :, None] + np.concatenate([away, -away], axis=2)
-    return drawn, np.full((len(mean), PREDICTIVE), 1.0 / PREDICTIVE)
+    return drawn, np.full((len(mean), n), 1.0 / n)
 
 
 def _exact(found: KalmanMoments, e: Experiment, prediction: np.ndarray) -> np.ndarray:
@@ -289,18 +293,25 @@ def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(x).all(axis=-1), score, np.nan)
 
 
+def spread_evenly(last: int, most: int) -> np.ndarray:
+    """Rows from 0 to `last`, as many as `most`."""
+    return np.unique(np.linspace(0, max(last, 0), most).astype(int))
+
+
 def crps_ahead(
     program: Program, e: Experiment, theta: np.ndarray, particles: np.ndarray, weights: np.ndarray,
-    stream: np.ndarray, feedback: bool, most: int = ORIGINS, horizons: Sequence[int] = HORIZONS,
+    stream: np.ndarray, feedback: bool, origins: np.ndarray | None = None,
+    horizons: Sequence[int] = HORIZONS,
 ) -> np.ndarray:  # fmt: skip
-    """(O, H, K) CRPS of each channel at each horizon, from O rows (`most`) on; NaN where nothing
-    was observed, or the record ends before.
+    """(O, H, K) CRPS of each channel at each horizon, from the rows `origins` (O,) on, by
+    default `ORIGINS` of them; NaN where nothing was observed, or the record ends before.
 
     particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : a transition names
     observations; rows that lack one are then not simulated on from.
     """
     simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
-    origins = np.unique(np.linspace(0, max(steps - 2, 0), most).astype(int))
+    if origins is None:
+        origins = spread_evenly(steps - 2, ORIGINS)
     if steps < 2:
         return np.full((len(origins), len(horizons), channels), np.nan)
     levels = np.empty(1)
