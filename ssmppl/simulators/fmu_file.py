@@ -22,6 +22,7 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.simulators.chosen_names import Chosen, chosen, identifier, required, unknown
+from ssmppl.simulators.engine import Engine
 
 VERSIONS = ("2", "3")
 REAL = ("Real", "Float64")
@@ -30,7 +31,7 @@ KEPT = 1e-3  # relative difference of two steps with and without a new beginning
 ERROR = 3  # fmi2Error, fmi3Error: of messages that are kept
 
 
-class FMUModel:
+class FMUModel(Engine):
     """A unit that moves a batch; `output` gives its outputs.
 
     Pickled as what it was made of: the file is read again.
@@ -213,20 +214,6 @@ class FMUModel:
         return out
 
     # -- what is called
-    def __call__(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """The states (B, n) after one interval of states (B, n), inputs (B, m) and parameters
-        (B, p); NaN where the unit fails (`reason` says why)."""
-        return self._run(state, inputs, parameters, sense=False)[0]
-
-    def output(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """The outputs (B, k) at states (B, n)."""
-        return self._run(state, inputs, parameters, sense=True)[0]
-
-    def reason(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> str:
-        """Why a call gives NaN at one point, (n,), (m,) and (p,); empty where it does not."""
-        x, u, p = (np.atleast_2d(np.asarray(a, dtype=float)) for a in (state, inputs, parameters))
-        return self._run(x, u, p, sense=False)[1].get(0, "")
-
     def _run(
         self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray, sense: bool
     ) -> tuple[np.ndarray, dict[int, str]]:

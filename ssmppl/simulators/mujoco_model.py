@@ -23,6 +23,7 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.simulators.chosen_names import Chosen, chosen, identifier, required
+from ssmppl.simulators.engine import Engine
 from ssmppl.simulators.mujoco_attributes import Target, target
 
 MODELS_BYTES = 64 * 2**20  # of models kept, one for each vector of parameters
@@ -71,7 +72,7 @@ def _ignore(text: Any) -> None:
 _silence = _Silence()
 
 
-class MujocoModel:
+class MujocoModel(Engine):
     """A MuJoCo model that moves a batch; `output` gives its sensors.
 
     Pickled as what it was made of: a file is read again.
@@ -186,20 +187,6 @@ class MujocoModel:
         return row
 
     # -- what is called
-    def __call__(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """The states (B, n) after one interval of states (B, n), inputs (B, m) and parameters
-        (B, p); NaN where MuJoCo warns or fails (`reason` says why)."""
-        return self._run(state, inputs, parameters, sense=False)[0]
-
-    def output(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """The sensors (B, k) at states (B, n), with the forces that act there."""
-        return self._run(state, inputs, parameters, sense=True)[0]
-
-    def reason(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> str:
-        """Why a call gives NaN at one point, (n,), (m,) and (p,); empty where it does not."""
-        x, u, p = (np.atleast_2d(np.asarray(a, dtype=float)) for a in (state, inputs, parameters))
-        return self._run(x, u, p, sense=False)[1].get(0, "")
-
     def _run(
         self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray, sense: bool
     ) -> tuple[np.ndarray, dict[int, str]]:

@@ -45,7 +45,14 @@ from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.batched_newton import climb_together
-from ssmppl.inference.optimisation.newton import GOOD, Top, climb, information_at, newton_step
+from ssmppl.inference.optimisation.newton import (
+    GOOD,
+    Top,
+    bfgs_update,
+    climb,
+    information_at,
+    newton_step,
+)
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.preparation.pilot import climb_to_mode
@@ -358,7 +365,7 @@ class Fitter:
         if effort.pilot:
             begun = [self._with_process_noise(space, share) for share in NOISE_SHARES[1:]]
             starts = best_of_many(densities, [z, *(s.z[s.positions] for s in begun)], seed)
-        found = climb_together(densities, starts)
+        found = climb_together(densities, starts, precise=not effort.approximate)
         if found is None:
             raise ArgumentError(
                 "the extended Kalman filter comes to no number at every point that was tried",
@@ -756,7 +763,7 @@ def stochastic_quasi_newton(
             if size < 0.01:
                 break
             continue
-        h = _update(h, step, g - new[1])
+        h = bfgs_update(h, step, g - new[1])
         z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
     distance, size = np.inf, 1.0
     for k in range(AVERAGED):
@@ -775,16 +782,6 @@ def _step_share(step: np.ndarray) -> float:
     """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
     coordinate at all."""
     return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
-
-
-def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Damped BFGS: H such that H s is about y, positive definite still (procedure 18.2)."""
-    hs = h @ s
-    curvature, along = float(s @ hs), float(s @ y)
-    if along < 0.2 * curvature:
-        y = (weight := 0.8 * curvature / (curvature - along)) * y + (1.0 - weight) * hs
-        along = float(s @ y)
-    return h - np.outer(hs, hs) / curvature + np.outer(y, y) / along
 
 
 def positive_definite(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:

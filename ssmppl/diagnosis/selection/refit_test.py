@@ -16,6 +16,7 @@ from functools import partial
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Task, child_seed
@@ -132,7 +133,10 @@ def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
 
 
 def affordable(augmented: AugmentedModels, experiments: Sequence[Experiment]) -> bool:
-    """Whether the fits of the test can be afforded."""
+    """Whether the fits of the test can be afforded: not those of a simulator, which is called for
+    every point of them."""
+    if simulators(augmented.base_fitter.problem.trace):
+        return False
     rows = sum(e.steps for e in experiments)
     cheap = augmented.base_fitter.exact or rows * augmented.settings.particles <= MOST_WORK
     return cheap and rows < MOST_ROWS

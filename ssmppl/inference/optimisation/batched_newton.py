@@ -3,8 +3,10 @@ one.
 
 Value, gradient and second derivatives are differences over one set of points, and the shares of a
 step are tried together with the differences at its whole, so that a step that climbs costs one
-call. Several climbs go on side by side in the same calls. Where the function is not concave,
-eigenvalues count by their size (`newton.newton_step`).
+call. Second derivatives take many points: they are taken where a climb starts, where a step led
+nowhere, and at the top; between these the slopes update them (`newton.bfgs_update`). Several climbs
+go on side by side in the same calls. Where the function is not concave, eigenvalues count by their
+size (`newton.newton_step`).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ssmppl.inference.optimisation.newton import Top, newton_step
+from ssmppl.inference.optimisation.newton import Top, bfgs_update, newton_step
 
 Function = Callable[[np.ndarray], np.ndarray]  # (B, F) -> (B,), -inf where there is no value
 
@@ -23,14 +25,17 @@ FIRST, SHORTEST, LONGEST = 0.02, 1e-4, 0.1  # steps of differences in z
 WIDTH = 0.05  # of the steps of differences, in standard deviations by the last curvature
 FARTHEST = 2.0  # of a step in any coordinate, in units of it where it is larger than one
 LATE = 3  # steps of the others once the highest is at its end
-SHARES = (1.0, 0.6, 0.3, 0.1, 0.03, 0.01, 1e-3)  # of a step that are tried
+SHARES = (1.0, 0.5, 0.15, 0.03, 1e-3)  # of a step that are tried
 GOOD = 1e-7  # that the quadratic still expects to gain, where a climb is at its end
 FINAL = 1e-3  # from where on differences are extrapolated to zero step
+NEAR = 1e-2  # likewise, where a climb that need not be precise is at its end
+SLOPES, CURVATURES, FINE = 1, 2, 3  # what a stencil tells
 
 
 @dataclass
 class Climber:
-    """One of the climbs. size : (F,) of its differences. path : where it has been."""
+    """One of the climbs. size : (F,) of its differences. path : where it has been. stale : whether
+    second derivatives are to be taken anew."""
 
     z: np.ndarray
     value: float
@@ -41,14 +46,25 @@ class Climber:
     reach: float = FARTHEST
     ended: bool = False
     path: list[np.ndarray] = field(default_factory=list)
+    stale: bool = True
+
+    @property
+    def tells(self) -> int:
+        """What its next stencil has to tell."""
+        if self.distance < FINAL:
+            return FINE
+        return CURVATURES if self.stale else SLOPES
 
     @property
     def top(self) -> Top:
         return Top(self.z, self.value, self.information, self.distance)
 
 
-def climb_together(function: Function, starts: np.ndarray) -> Climber | None:
+def climb_together(function: Function, starts: np.ndarray, precise: bool = True) -> Climber | None:
     """The highest of the climbs from starts (K, F); None where none has a value.
+
+    precise : to the very top, with the second derivatives there; else to within `NEAR`, with what
+        the climb has made of them.
 
     Ctrl-C is left to the caller, who sees every point that the function is asked for.
     """
@@ -72,6 +88,8 @@ def climb_together(function: Function, starts: np.ndarray) -> Climber | None:
         if not (going and further):
             break
         _step(function, going)
+        for c in climbers if not precise else ():
+            c.ended = c.ended or c.distance < NEAR
     return max(climbers, key=lambda c: c.value)
 
 
@@ -83,7 +101,7 @@ def _step(function: Function, climbers: list[Climber]) -> None:
         size = float(np.max(np.abs(move) / np.maximum(1.0, np.abs(c.z))))
         moves.append(move * min(1.0, c.reach / max(size, 1e-300)))
         own = [c.z + share * moves[-1] for share in SHARES[1:]]
-        own += _stencil(c.z + moves[-1], c.size, c.distance < FINAL)
+        own += _stencil(c.z + moves[-1], c.size, c.tells)
         points += own
         counts.append(len(own))
     found = np.split(function(np.array(points)), np.cumsum(counts)[:-1])
@@ -96,12 +114,15 @@ def _step(function: Function, climbers: list[Climber]) -> None:
             # a gain below the rounding of the function: the step is as right as can be told
             c.ended = c.distance < FINAL or c.reach < SHORTEST
             c.reach *= 0.1
+            if not c.ended and not c.stale:
+                c.stale = True
+                later.append(c)
             continue
         c.z, c.value = c.z + SHARES[k] * move, float(tried[k])
         c.path.append(c.z.copy())
         c.reach = FARTHEST if k == 0 else max(c.reach * 0.5, 10.0 * SHORTEST)
         if k == 0:
-            _take(c, stencil)
+            _take(c, stencil, c.tells, move)
         else:
             later.append(c)
     if later:
@@ -110,22 +131,24 @@ def _step(function: Function, climbers: list[Climber]) -> None:
 
 def _differentiate(function: Function, climbers: list[Climber]) -> None:
     """The derivatives of each where it stands."""
-    sets = [_stencil(c.z, c.size, c.distance < FINAL) for c in climbers]
+    for c in climbers:
+        c.stale = True
+    sets = [_stencil(c.z, c.size, c.tells) for c in climbers]
     found = function(np.array([z for own in sets for z in own]))
     for c, values in zip(
         climbers, np.split(found, np.cumsum([len(s) for s in sets])[:-1]), strict=True
     ):
-        _take(c, values)
+        _take(c, values, c.tells)
 
 
-def _stencil(z: np.ndarray, size: np.ndarray, fine: bool) -> list[np.ndarray]:
+def _stencil(z: np.ndarray, size: np.ndarray, tells: int) -> list[np.ndarray]:
     """z, then for each step its two sides of each coordinate, and of each pair together."""
     points, n = [z], len(z)
-    for times in (1.0, 2.0) if fine else (1.0,):
+    for times in (1.0, 2.0) if tells == FINE else (1.0,):
         for sign in (times, -times):
             for i in range(n):
                 points.append(_moved(z, {i: sign * size[i]}))
-        for sign in (times, -times):
+        for sign in (times, -times) if tells > SLOPES else ():
             for i in range(n):
                 points += [_moved(z, {i: sign * size[i], j: sign * size[j]}) for j in range(i)]
     return points
@@ -138,20 +161,47 @@ def _moved(z: np.ndarray, by: dict[int, float]) -> np.ndarray:
     return out
 
 
-def _take(c: Climber, values: np.ndarray) -> None:
-    """Slope, curvature and the next steps from the values at a stencil."""
-    slope, curvature = derivatives(values, c.size)
+def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = None) -> None:
+    """Slope, curvature and the next steps from the values at a stencil, that `move` led to."""
+    if tells == SLOPES:
+        assert move is not None
+        slope = _slopes(values, c.size)
+        curvature = -_updated(c.information, move, c.slope - slope)
+        c.stale = not np.all(np.isfinite(slope))
+    else:
+        slope, curvature = derivatives(values, c.size)
+        c.stale = False
     missing = ~np.isfinite(slope)
     c.slope = np.where(missing, 0.0, slope)
     c.information = np.where(np.isfinite(curvature), -curvature, 0.0)
     step = newton_step(c.slope, c.information)
     c.distance = 0.5 * float(c.slope @ step)
-    fine = len(values) > 1 + 2 * len(c.z) + len(c.z) * (len(c.z) - 1)
-    c.ended = c.distance < GOOD and fine and not missing.any()
+    c.ended = c.distance < GOOD and tells == FINE and not missing.any()
     with np.errstate(divide="ignore"):
         wanted = WIDTH / np.sqrt(np.abs(np.diagonal(c.information)))
     wanted = np.where(missing, 0.1 * c.size, wanted)
     c.size = np.clip(wanted, SHORTEST, LONGEST)
+
+
+def _slopes(values: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """(F,) from the values at a stencil of `SLOPES`, on one side where the other has none."""
+    n = len(size)
+    up, down = values[1 : 1 + n], values[1 + n : 1 + 2 * n]
+    with np.errstate(invalid="ignore"):
+        one_sided = np.where(np.isfinite(up), up - values[0], values[0] - down) / size
+        both = (up - down) / (2.0 * size)
+    return np.where(np.isfinite(both), both, one_sided)
+
+
+def _updated(information: np.ndarray, move: np.ndarray, fall: np.ndarray) -> np.ndarray:
+    """A positive definite (F, F) for which `fall` of the slopes (F,) is about that along `move`;
+    by the sizes of the eigenvalues of the last, as steps are."""
+    values, vectors = np.linalg.eigh(information)
+    least = 1e-8 * float(np.max(np.abs(values), initial=1e-300))
+    h = (vectors * np.maximum(np.abs(values), least)) @ vectors.T
+    if not move @ h @ move > 0.0:
+        return h
+    return bfgs_update(h, move, np.where(np.isfinite(fall), fall, 0.0))
 
 
 def derivatives(values: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -283,3 +283,14 @@ def newton_step(slope: np.ndarray, information: np.ndarray, flat: float = FLAT) 
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     values = np.maximum(np.abs(values), LEAST)
     return (vectors @ ((vectors.T @ (slope / scale)) / values)) / scale
+
+
+def bfgs_update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Damped BFGS: H (F, F) such that H s is about y, positive definite still (Nocedal and Wright,
+    *Numerical Optimization*, 2nd edition, procedure 18.2)."""
+    hs = h @ s
+    curvature, along = float(s @ hs), float(s @ y)
+    if along < 0.2 * curvature:
+        y = (weight := 0.8 * curvature / (curvature - along)) * y + (1.0 - weight) * hs
+        along = float(s @ y)
+    return h - np.outer(hs, hs) / curvature + np.outer(y, y) / along

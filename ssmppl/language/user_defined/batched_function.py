@@ -107,11 +107,18 @@ class BatchedFunction:
                 k = int(np.argmax(bad))
                 lost = ", ".join(np.array(self.results)[np.isnan(values[k])])
                 warnings.warn(
-                    f"the simulator {self.title} gives NaN for {lost} at {self._told(points[k])}; "
-                    "where it does the likelihood is zero",
+                    f"the simulator {self.title} gives NaN for {lost} at {self._told(points[k])}"
+                    f"{self._reason(points[k])}; where it does the likelihood is zero",
                     stacklevel=2,
                 )
         return values
+
+    def _reason(self, point: np.ndarray) -> str:
+        """Why there is no value at a point (K + 1,), where the function can tell."""
+        owner = getattr(self.function, "__self__", self.function)
+        tell = getattr(owner, "reason", None)
+        said = tell(*(part[0] for part in self._parts(point[None]))) if callable(tell) else ""
+        return f": {said}" if said else ""
 
     def _parts(self, points: np.ndarray) -> list[np.ndarray]:
         """States, inputs and parameters, each an array of its own."""
