@@ -7,7 +7,7 @@ body's inertia follows, are set in the specification (`MjSpec`), which is compil
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from ssmppl.errors import ModelError, nearest_first
 from ssmppl.expressions.expr import user_location
 
 AXES = ("x", "y", "z")
+HINGE = 3  # mjJNT_HINGE
 
 
 def _always(model: Any, k: int) -> str:
@@ -280,3 +281,28 @@ def _listed(name: str, known: Iterable[str]) -> str:
 
 def _wrong(text: str, what: str, fix: str) -> ModelError:
     return ModelError(f"parameters: {text!r} {what}", fix=fix, where=user_location())
+
+
+def of_joint(
+    effect: str, model: Any, k: int, strength: float, shape: Mapping[str, float]
+) -> tuple[str, str] | None:
+    """The attribute of joint k that carries an effect of `ssm.diagnose`, and its value in words.
+
+    Dry friction and polynomials of the speed and of the angle are what the engine has of its own:
+    damping is -(a v + b v |v| + c v^3), stiffness -(a x + b x^2 + c x^3), from the file's `ref`.
+    """
+    dof = int(model.jnt_dofadr[k])
+    if effect == "coulomb friction":
+        return "frictionloss", f"{model.dof_frictionloss[dof] + strength:.3g}"
+    if effect == "quadratic drag":
+        return "damping", f"second coefficient {model.dof_dampingpoly[dof, 0] + strength:.3g}"
+    if effect in ("quadratic stiffness", "cubic stiffness"):
+        at = int(effect == "cubic stiffness")
+        value = model.jnt_stiffnesspoly[k, at] + strength
+        return "stiffness", f"{('second', 'third')[at]} coefficient {value:.3g}"
+    if effect == "hard stop" and "h" in shape:
+        h, middle = shape["h"], shape.get("middle")
+        ends = f"{h:.3g}" if middle is None else f"{middle - h:.3g} to {middle + h:.3g}"
+        unit = "rad" if model.jnt_type[k] == HINGE else "m"
+        return "range", f"an end at {ends} {unit}, with a stiffness of {strength:.3g}"
+    return None

@@ -24,7 +24,7 @@ from ssmppl.expressions.expr import user_location
 from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.simulators.chosen_names import Chosen, chosen, identifier, required
 from ssmppl.simulators.engine import Engine
-from ssmppl.simulators.mujoco_attributes import Target, target
+from ssmppl.simulators.mujoco_attributes import Target, of_joint, target
 
 MODELS_BYTES = 64 * 2**20  # of models kept, one for each vector of parameters
 BATCHES = 4  # kept, one for each size of a batch
@@ -147,6 +147,8 @@ class MujocoModel(Engine):
         own = {n: (n,) for n in joints}
         pushed = chosen(forces, own, "forces", self.file, lambda n: f"{identifier(n)}_force")
         self.forces = {name: f"{identifier(n)}_velocity" for name, n in pushed.items()}
+        self._pushed = dict(pushed)  # the joint that each acts on
+        self._actuated = dict(given)  # the actuator of each control
         self._force = np.array(
             [self.model.jnt_dofadr[joints[n]] for n in pushed.values()], dtype=int
         )
@@ -187,6 +189,25 @@ class MujocoModel(Engine):
         return row
 
     # -- what is called
+    def attribute_of(
+        self, effect: str, argument: str, strength: float, shape: Mapping[str, float]
+    ) -> str:
+        """Which attribute of the file would carry an effect that `ssm.diagnose` names, and at what
+        value; "" where none does.
+
+        argument : the force or control through which it acts. strength : in that one's unit. shape
+        : of the effect.
+        """
+        joint, control = self._pushed.get(argument), self._actuated.get(argument)
+        if joint is not None:
+            k = self.objects["joint"][joint]
+            found = of_joint(effect, self.model, k, strength, shape)
+            return f"{found[0]} of the joint {joint!r}: {found[1]}" if found else ""
+        if control is not None and effect == "input delay" and "delay" in shape:
+            seconds = shape["delay"] * self.interval
+            return f"delay of the actuator {control!r}: {seconds:.3g} s, in whole rows"
+        return ""
+
     def _run(
         self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray, sense: bool
     ) -> tuple[np.ndarray, dict[int, str]]:

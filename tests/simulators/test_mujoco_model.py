@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 from string import Template
 
 import numpy as np
@@ -357,3 +358,37 @@ def test_an_attribute_of_two_kinds_of_objects_needs_the_kind():
     with pytest.raises(ssm.ModelError, match=r'"body:bob\.mass" or "geom:bob\.mass"'):
         mujoco(text, parameters={"m": "bob.mass"})
     assert mujoco(text, parameters={"m": "body:bob.mass"}).step.values == {"m": 0.7}
+
+
+@pytest.mark.parametrize(
+    ("effect", "argument", "shape", "wanted"),
+    [
+        ("coulomb friction", "pivot_force", {"v0": 0.1}, "frictionloss of the joint 'pivot': 0.25"),
+        ("quadratic drag", "pivot_force", {}, "damping of .*second coefficient 0.25"),
+        ("cubic stiffness", "pivot_force", {}, "stiffness of .*third coefficient 0.25"),
+        ("hard stop", "pivot_force", {"h": 1.5}, "range of .*at 1.5 rad"),
+        ("hard stop", "pivot_force", {"h": 1.5, "middle": 0.5}, "-1 to 2 rad"),
+        ("input delay", "motor", {"delay": 2.0}, "delay of the actuator 'motor': "),
+        ("gravity", "pivot_force", {}, "^$"),
+        ("input delay", "pivot_force", {"delay": 2.0}, "^$"),
+    ],
+)  # fmt: skip
+def test_which_attribute_carries_an_effect(pendulum, effect, argument, shape, wanted):
+    told = pendulum.step.attribute_of(effect, argument, 0.25, shape)
+    assert re.search(wanted, told)
+
+
+def test_polynomials_of_speed_and_angle_are_the_engines():
+    """damping="a b c" is -(a v + b v |v| + c v^3), stiffness="a b c" is -(a x + b x^2 + c x^3)."""
+    engine = pytest.importorskip("mujoco")
+    for given, values in (("damping", {1.0: -6.0, 2.0: -34.0, -2.0: 34.0}),
+                          ("stiffness", {1.0: -6.0, 2.0: -34.0, -2.0: 18.0})):  # fmt: skip
+        model = engine.MjModel.from_xml_string(
+            f"<mujoco><worldbody><body><joint {given}='1 2 3'/><inertial pos='0 0 0' mass='1' "
+            "diaginertia='1 1 1'/></body></worldbody></mujoco>"
+        )
+        for value, force in values.items():
+            data = engine.MjData(model)
+            data.qpos[0] = data.qvel[0] = value
+            engine.mj_forward(model, data)
+            assert data.qfrc_passive[0] == pytest.approx(force)

@@ -10,6 +10,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.report import tables
+from ssmppl.diagnosis.report.engine_attributes import attribute_of
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.diagnosis.report.report import GapReport
@@ -61,6 +62,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
         free = table("free_run", lambda: tables.run_table(r.experiments, channels, *runs))
     causes, classes = tabulate("causes"), tabulate("classes")
     leading: list[dict[str, Any]] = []
+    attributes: dict[str, str] = {}
     if found is not None:
         causes = table("causes", lambda: tables.causes_table(
             screen, r.refits, found, order, r.tested, r.screened))  # fmt: skip
@@ -68,6 +70,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
             screen, found, order, r.separating))  # fmt: skip
         if len(causes) and (text or r.unfitted is not None):
             leading = table("leading", lambda: _leading(r, order), leading)
+        attributes = table("attributes", lambda: _attributes(r, order, causes, leading), {})
     initial_law = next(
         (x.fitter.initial_law for x in [*r.refits, r.chosen] if x and x.fitter.initial_law), None
     )
@@ -81,7 +84,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
         detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
         free_run=free, not_applicable=_not_applicable(screen), missing=missing,
         model=augmented, model_text=text, chosen=r.names if text else [], estimates=estimates,
-        leading=leading, parts=_parts(r), notes=notes,
+        leading=leading, attributes=attributes, parts=_parts(r), notes=notes,
         settings={**r.settings, "candidates": len(set(screen.groups.tolist())),
                   "shapes": len(screen.design.candidates),
                   "samples": sum(e.steps for e in r.experiments), "simulated sets": screen.sets,
@@ -114,6 +117,22 @@ def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
     ]
 
 
+def _attributes(
+    r: Results, order: Sequence[int], causes: Any, leading: Sequence[dict[str, Any]]
+) -> dict[str, str]:
+    """ "effect in equation" -> what in the engine's own file would carry it."""
+    refitted = {refit.index[0]: refit.candidates[0] for refit in r.refits if len(refit.index) == 1}
+    strengths = dict(enumerate(causes["estimate"]))
+    strengths |= {d["row"]: d["estimate"] for d in leading if "estimate" in d}
+    out = {}
+    for i, k in enumerate(order[: len(causes)]):
+        c = refitted.get(k, r.screen.design.candidates[k])
+        found = attribute_of(r.trace, c, float(strengths[i]))
+        if found:
+            out[f"{c.effect.name} in {c.equation}"] = found
+    return out
+
+
 def _curve(r: Results, decision: Decision) -> Any:
     """The estimated curve that goes with the verdict; None where there is none, or an error ended
     it."""
@@ -144,6 +163,7 @@ def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None,
         text = model_text(
             added, title=f"{r.trace.name} with {names}",
             notes=["Fitted values:", *(f"{n} = {v:.6g}" for n, v in values.items())],
+            added=chosen.candidates,
         )  # fmt: skip
         return to_model(added), text
     except SSMError as error:

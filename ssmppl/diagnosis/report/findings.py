@@ -83,6 +83,7 @@ class Findings:
     model_text: str = ""
     chosen: list[str] = field(default_factory=list)
     leading: list[dict[str, Any]] = field(default_factory=list)
+    attributes: dict[str, str] = field(default_factory=dict)
     estimates: dict[str, dict[str, tuple[Any, Any]]] = field(default_factory=dict)
     parts: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)

@@ -26,6 +26,7 @@ from ssmppl.diagnosis.model.changed_laws import substituted
 from ssmppl.diagnosis.report.spelling import Lines
 from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
+from ssmppl.expressions.batched.call import OP
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
 from ssmppl.language.checks.new_values import SUFFIX
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
@@ -176,7 +177,7 @@ class _Writer:
 
     def _law(self, role: str, sites: list[Site]) -> str:
         roots = [e for s in sites for e in nodes_of(s.distribution)]
-        used = symbols_of(roots)
+        used = _read(roots)
         wanted = {s.data[1] for s in used}
         new = [n + SUFFIX for n in self.trace.initial if role == "transition"]
         known = [*self.trace.initial, *new, *self.trace.observations, *self.trace.inputs,
@@ -282,6 +283,14 @@ def _wishes(role: str, sites: list[Site]) -> dict[Expr, str]:
     return out
 
 
+def _read(roots: Sequence[Expr]) -> frozenset[Expr]:
+    """The symbols that a law reads. Simulators are told the row, which is not written."""
+    nodes = topological(roots)
+    rows = {n.args[-1] for n in nodes if n.op == OP}
+    read = {a for n in nodes for a in (n.args[:-1] if n.op == OP else n.args)}
+    return symbols_of(roots) - (rows - read - set(roots))
+
+
 def _same(values: Any) -> bool:
     flat = list(array(values).ravel())
     return all(e is flat[0] for e in flat)
@@ -317,12 +326,12 @@ def _numbered(laws: list[str]) -> list[str]:
 
 # -- the terms of an effect
 def terms_with(roots: Iterable[Expr], parameter: Expr) -> list[Expr]:
-    """The largest parts of sums that hold the parameter."""
+    """The largest parts of sums that hold the parameter, those in what a simulator is given too."""
     out: list[Expr] = []
     stack = [r for r in roots if depends_on(r, [parameter])]
     while stack:
         node = stack.pop(0)
-        if node.op in _ADDITIVE:
+        if node.op in _ADDITIVE or node.op == OP or (node.op == "item" and node.args[0].op == OP):
             stack += [a for a in node.args if depends_on(a, [parameter])]
         elif node.args and node not in out:
             out.append(node)

@@ -48,6 +48,8 @@ class GapReport(Findings):
     leading : for each effect that the verdict names, its `row` in `causes`, and form, sign,
         estimate and se in the model with all of them; or `row` and `unfitted` for one that the
         screen found and that could not be fitted.
+    attributes : of a model that calls a physics engine, "effect in equation" -> which attribute of
+        the engine's own file would carry it, and at what value.
     estimates : {"before": {parameter: (value, standard error)}, "after": ...}; error 0 if fixed.
     parts : {"screen": (first, last), "confirm": ...}, row labels of the rows that were used, or
         {"cross-fitting": number of blocks}; any further entry is text, such as "choice".

@@ -332,6 +332,9 @@ def which(report: Findings) -> list[str]:
             text += f"; log-likelihood gain {number(gain, 2)} nats{alone}{by}"
             text += f", {p_text(row.get('p'))}"
         out.append(sentence(text))
+        carried = report.attributes.get(f"{row['effect']} in {row['equation']}")
+        if carried:
+            out.append(f"The simulator's file carries it as {carried}.")
         others = rivals(report, row)
         if others:
             names = listed([row_label(r) for r in others], "or")
