@@ -42,6 +42,8 @@ def _arguments(trace: Trace, c: Candidate) -> list[tuple[Any, str]]:
         (node.data.function.simulator, name)
         for node in topological(roots)
         if node.op == OP
-        for name, given in zip(node.data.function.arguments, node.args, strict=True)
+        for name, given in zip(
+            node.data.function.arguments, node.args[:-1], strict=True
+        )  # but the row
         if given is part.seen_from("transition")
     ]

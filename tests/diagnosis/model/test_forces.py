@@ -10,6 +10,7 @@ from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.equations import Equations
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import score_columns
+from ssmppl.diagnosis.report.engine_attributes import attribute_of
 from ssmppl.diagnosis.report.model_file import model_text
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
@@ -154,3 +155,22 @@ def test_the_file_of_the_augmented_model_calls_the_simulator_with_the_force():
     call = next(line for line in text.splitlines() if "coupled([" in line)
     assert "[u1, u2, 0, -quadratic_drag]" in call
     assert "def transition(x1, x2, v1, v2, u1, u2, d, s, quadratic_drag_v2):" in text
+
+
+def test_the_report_asks_the_engine_that_the_effect_acts_through():
+    traced, (delay, *_) = offered(model_of(), ["input delay"])
+    assert attribute_of(traced, delay, 0.7) == ""  # a function of NumPy has no file
+
+    class Engine:
+        def __call__(self, state, inputs, parameters):
+            return step(state, inputs, parameters)
+
+        def attribute_of(self, effect, argument, strength, shape):
+            return f"{effect}, {argument}, {strength}, {sorted(shape)}"
+
+    own = ssm.simulator(**NAMES, forces={"f1": "v1", "f2": "v2"}, name="engine")(Engine())
+    traced, (delay, *_) = offered(model_of(own), ["input delay"])
+    assert attribute_of(traced, delay, 0.7) == "input delay, u1, 0.7, ['delay']"
+    traced, candidate = drag(model_of(own))
+    assert attribute_of(traced, candidate, 0.7) == "quadratic drag, f2, 0.7, []"
+    assert attribute_of(traced, candidate, 0.0) == ""
