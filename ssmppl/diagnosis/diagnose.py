@@ -5,6 +5,7 @@ The stages are the fit, the screen, the refits and the gain on held-out rows; ea
 
 from __future__ import annotations
 
+import itertools
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -162,7 +163,8 @@ class _Diagnosis:
         }  # fmt: skip
         made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
         # Threads that wait for one simulator take turns, which takes longer than one alone.
-        self.own = ThreadPoolExecutor(1) if executor is None and simulators(self.trace) else None
+        self.called = bool(simulators(self.trace))
+        self.own = ThreadPoolExecutor(1) if executor is None and self.called else None
         self.checkpoint = Checkpoint(
             checkpoint, made_from, executor or self.own, progress, failures
         )
@@ -350,21 +352,21 @@ class _Diagnosis:
         done = sum(f"screening/{k}" in self.checkpoint for k in range(SETS[self.mode]))
         if not self.checkpoint.progress or done > SETS[self.mode] // 2:
             return
-        whole = design.theta(fit.theta)
+        whole, runs = design.theta(fit.theta), itertools.count()
+
+        def stream() -> np.ndarray:  # another one each time: a simulator's values are kept
+            return random_state(self._seed(Stage.TIMING), next(runs))
+
         # A refit's code is about as much to compile as the screen's.
         for_screen, generating = timed(
-            lambda: design.smoother.run(experiments, whole, random_state(self._seed(Stage.TIMING)))
+            lambda: design.smoother.run(experiments, whole, stream(), ahead=self.called)
         )
-        for_fit, _ = timed(
-            lambda: base.smoother.run(
-                experiments, fit.theta, random_state(self._seed(Stage.TIMING))
-            )
-        )
-        of_climbs, _ = timed(lambda: base.value(experiments, fit.theta))
+        for_fit, _ = timed(lambda: base.smoother.run(experiments, fit.theta, stream()))
+        of_climbs = base.seconds_of_value(experiments, fit.theta)
         blocks = 0 if self.split else FOLDS
         rest = expected(
             Timed(for_screen, for_fit, generating, of_climbs), SETS[self.mode], self.mode, blocks,
-            self.checkpoint.executor,
+            self.checkpoint.executor, simulator=self.called,
         )  # fmt: skip
         self.checkpoint.say(f"{self.mode} mode: {in_words(rest)} expected from here on")
 

@@ -12,6 +12,7 @@ from ssmppl.inference.run.executors import workers_of
 
 REFITS = 18  # of single effects, their shapes, pairs and the reference, about
 EVALUATIONS, FIT_PASSES = 4000, 60  # likelihoods and passes over the data in a fit, about
+TOGETHER = 800  # likelihoods in a fit where many are looked at in one call
 APPROXIMATE = 800  # likelihoods in an approximate fit
 SCREENS = 1.0  # as long as the first one that follow it: for further effects, under other inputs
 TEXT = 0.5  # of the time that the screen's code took, which a fit's takes, one at a time
@@ -41,20 +42,27 @@ def timed(run: Callable[[], object]) -> tuple[float, float]:
     return end - middle, max(middle - begin - (end - middle), 0.0)
 
 
-def seconds(found: Timed, sets: int, mode: str, folds: int, executor: Executor | None) -> float:
+def seconds(
+    found: Timed, sets: int, mode: str, folds: int, executor: Executor | None, *,
+    simulator: bool = False,
+) -> float:  # fmt: skip
     """Expected, from the end of the first fit on.
 
     sets : simulated in the screen. folds : blocks that are left out in turn, 0 for three parts.
+    simulator : whether the model calls one: its climbs look at many points at once, and take fewer
+    in all, and simulated data are not refitted.
     """
     workers = workers_of(executor) or _cores()
     screen = sets * found.screen_pass / workers
     if mode == "fast":
         return screen
-    one = EVALUATIONS * found.likelihood + FIT_PASSES * found.fit_pass
+    evaluations = TOGETHER if simulator else EVALUATIONS
+    one = evaluations * found.likelihood + FIT_PASSES * found.fit_pass * (not simulator)
     approximate, text = APPROXIMATE * found.likelihood, TEXT * found.generating
     total = screen * (1.0 + SCREENS) + REFITS * (one / workers + text)
     if folds:
-        total += SIMULATED * (approximate + found.screen_pass) / workers
+        if not simulator:
+            total += SIMULATED * (approximate + found.screen_pass) / workers
         block = FOLD_FITS * approximate + FOLD_PASSES * found.screen_pass
         total += folds * (block / workers + 2.0 * text)
     return BESIDE * total

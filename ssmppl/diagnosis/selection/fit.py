@@ -33,6 +33,7 @@ from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
+from ssmppl.diagnosis.run.expected_time import timed
 from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.diagnosis.selection.densities import best_of_many, densities_of, density_of
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
@@ -79,6 +80,7 @@ SPREAD = 0.1  # least information of a logarithm that steps are made with
 # Likelihoods and information by simulation.
 PILOT_PARTICLES = 300
 PRECISE, DOUBLINGS = 0.2, 2  # nats: error of a log-likelihood for which particles are doubled
+TOGETHER = 16  # points that are timed, where many are looked at in one call
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
 LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
 LARGEST = 1e100  # of a score: what is beyond is an overflow
@@ -323,6 +325,14 @@ class Fitter:
             return self.kalman.log_likelihood(experiments, theta)
         return smooth(theta) if smooth else self.estimate(experiments, theta, random_state(
             np.random.SeedSequence(0)))  # fmt: skip
+
+    def seconds_of_value(self, experiments: Sequence[Experiment], theta: np.ndarray) -> float:
+        """How long `value` takes at one of the points that a climb looks at together."""
+        many = self._extended_of_many(replace(self.problem, experiments=tuple(experiments)))
+        if many is None:
+            return timed(lambda: self.value(experiments, theta))[0]
+        points = theta * (1.0 + 1e-6 * np.arange(TOGETHER))[:, None]
+        return timed(lambda: many(points))[0] / TOGETHER
 
     # -- by the extended Kalman filter
     def _extended_log_likelihood(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
