@@ -83,10 +83,11 @@ def with_forces(trace: Trace, pushes: list[tuple[Force, Expr]]) -> Trace:
 def linear(trace: Trace, pushes: list[tuple[Force, Expr]]) -> Trace:
     """The trace with what increments of forces do to first order.
 
-    Where the force is a state's noise, as torque noise is, its mean moves in place of it: the next
-    force is (w + g) as before, and what follows from the noise alone stays as it was. Else the
-    rates' means move; what integrates them follows a step later. Either way no deterministic state
-    changes with the strengths, which would have to be carried for each of them.
+    Where the force has a noise w of its own, as torque noise is, w + g takes the place of w: its
+    mean is g of the states that it acts on, and they follow from it as they did from w (at the
+    first row, which no step leads to, it stays w). Else the rates' means move, by g times their
+    derivatives in the force; what integrates them follows a step later. Either way no deterministic
+    state changes with the strengths, whose derivatives would have to be carried for each of them.
     """
     sites, added = dict(trace.transition), dict[str, dict[tuple[int, ...], Expr]]()
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.report import tables
@@ -23,6 +24,8 @@ from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP
 from ssmppl.errors import SSMError
 from ssmppl.language.model.model import Model
+
+TOLD = 12  # causes of which it is told which attribute of an engine's file would carry them
 
 
 def build_report(r: Results, seconds: float) -> GapReport:
@@ -120,12 +123,14 @@ def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
 def _attributes(
     r: Results, order: Sequence[int], causes: Any, leading: Sequence[dict[str, Any]]
 ) -> dict[str, str]:
-    """ "effect in equation" -> what in the engine's own file would carry it."""
+    """ "effect in equation" -> what in the engine's own file would carry it; of the first rows."""
+    if not simulators(r.trace):
+        return {}
     refitted = {refit.index[0]: refit.candidates[0] for refit in r.refits if len(refit.index) == 1}
     strengths = dict(enumerate(causes["estimate"]))
     strengths |= {d["row"]: d["estimate"] for d in leading if "estimate" in d}
     out = {}
-    for i, k in enumerate(order[: len(causes)]):
+    for i, k in enumerate(order[: min(len(causes), TOLD)]):
         c = refitted.get(k, r.screen.design.candidates[k])
         found = attribute_of(r.trace, c, float(strengths[i]))
         if found:
