@@ -56,6 +56,10 @@ from ssmppl.inference.verbs.simulate import check_samplers
 from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.model.model import Model
 
+BY_EXTENDED = (
+    "The model calls a simulator: likelihoods, and the states behind the scores, are those of an "
+    "extended Kalman filter, which is an approximation."
+)
 SETS = {"fast": 100, "full": 200}  # simulated data sets
 PARTICLES = {"fast": 500, "full": 1000}
 TWISTED_PARTICLES = {"fast": 100, "full": 100}  # a few that know where to go do more
@@ -144,6 +148,7 @@ class _Diagnosis:
         self.split: RowSplit | None = None
         if mode == "full" and long_enough(self.experiments):
             self.split = three_parts(self.experiments)
+        self.called = bool(simulators(self.trace))
         missing = self.problem.program.missing
         if mode == "full" and self.split is None:  # blocks of rows will be set missing
             missing = replace(missing, none=False)
@@ -157,13 +162,13 @@ class _Diagnosis:
             for n, s in self.trace.observations.items()
             if isinstance(s.distribution, UserDefined) and not s.distribution.has_cdf
         ]
+        self.notes += [BY_EXTENDED] * self.called
         described = {
             "alpha": alpha, "seed": self.root.entropy, "fixed": self.fixed, "particles": number,
             "sets": SETS[mode],
         }  # fmt: skip
         made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
         # Threads that wait for one simulator take turns, which takes longer than one alone.
-        self.called = bool(simulators(self.trace))
         self.own = ThreadPoolExecutor(1) if executor is None and self.called else None
         self.checkpoint = Checkpoint(
             checkpoint, made_from, executor or self.own, progress, failures
