@@ -12,6 +12,7 @@ from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.smoothing import Pass
 from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 
@@ -53,7 +54,8 @@ def predict(
         passes = fitter.smoother.run(experiments, fit.theta, stream)
         for p in passes:
             p.log_increments[:1] += fitter.log_correction
-        if fitter.exact or fitter.settings.proposal != "twisted":
+        called = isinstance(fitter.smoother.extended, Extended)  # its increments are of each row
+        if fitter.exact or called or fitter.settings.proposal != "twisted":
             return passes
         return [
             replace(p, log_increments=stretches(fitter, fit, e, c, stream))
