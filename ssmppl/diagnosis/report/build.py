@@ -123,7 +123,8 @@ def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
 def _attributes(
     r: Results, order: Sequence[int], causes: Any, leading: Sequence[dict[str, Any]]
 ) -> dict[str, str]:
-    """ "effect in equation" -> what in the engine's own file would carry it; of the first rows."""
+    """ "effect in equation" -> what in the engine's own file would carry it; of those among the
+    first rows that are significant."""
     if not simulators(r.trace):
         return {}
     refitted = {refit.index[0]: refit.candidates[0] for refit in r.refits if len(refit.index) == 1}
@@ -131,6 +132,9 @@ def _attributes(
     strengths |= {d["row"]: d["estimate"] for d in leading if "estimate" in d}
     out = {}
     for i, k in enumerate(order[: min(len(causes), TOLD)]):
+        named = i in {d["row"] for d in leading} or float(causes["p"].iloc[i]) <= r.alpha
+        if not named:
+            continue
         c = refitted.get(k, r.screen.design.candidates[k])
         found = attribute_of(r.trace, c, float(strengths[i]))
         if found:
