@@ -70,12 +70,17 @@ def test_scores_and_maxima_are_those_of_the_model_written_out(data):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method", [ssm.ISMCMC(particles=30), ssm.PGAS(particles=20), ssm.PMMH(particles=30)]
+    ("method", "draws"),
+    [
+        (ssm.ISMCMC(particles=30), 500),
+        (ssm.PGAS(particles=20), 500),
+        (ssm.PMMH(particles=30), 5000),
+    ],
 )
-def test_posteriors_are_those_of_the_model_written_out(data, method):
+def test_posteriors_are_those_of_the_model_written_out(data, method, draws):
     """Means within five standard errors of the difference of two chains with an ESS of 50 each."""
     found, exact = (
-        ssm.sample(m, data, method, draws=500, warmup=500, chains=2, seed=s, progress=False)
+        ssm.sample(m, data, method, draws=draws, warmup=draws, chains=2, seed=s, progress=False)
         for m, s in ((OPAQUE, 1), (PLAIN, 2))
     )
     for name in THETA:
