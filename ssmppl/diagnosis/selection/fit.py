@@ -6,11 +6,6 @@ end at its top, and from starts that nothing is known of, they are climbed with 
 Others are climbed from several starts, and from there by the particle smoother's score. How far the
 top still is is measured in nats: g' H^-1 g / 2 is what a quadratic would still gain.
 
-The climb by noisy scores is a quasi-Newton ascent: z <- z + H^-1 g on the unconstrained scale, with
-H an estimate of the information, kept up by damped BFGS updates (Nocedal and Wright 2006, procedure
-18.2); near the top the steps shrink as 1 / k, which averages the noise out (Robbins and Monro
-1951).
-
 Scales and shares may be driven to a bound of their support: a process noise of nothing. There the
 likelihood is flat on the unconstrained scale: where the climb ended says nothing (1e-4 or 1e-13, as
 it happened), and a curvature there is no information. Such a number is held at the value nearest to
@@ -36,6 +31,7 @@ from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
 from ssmppl.diagnosis.run.expected_time import timed
 from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.diagnosis.selection.densities import best_of_many, densities_of, density_of
+from ssmppl.diagnosis.selection.noisy_ascent import NEAR, stochastic_quasi_newton
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
@@ -49,10 +45,8 @@ from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.newton import (
     GOOD,
     Top,
-    bfgs_update,
     climb,
     information_at,
-    newton_step,
 )
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
@@ -64,15 +58,7 @@ from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.transforms import transforms
 
-Point = tuple[float, np.ndarray]  # value and gradient
-
 # Climbs.
-NEAR = 1.0  # nats from the top where the first phase ends
-MOST_STEPS = 20  # of the first phase
-AVERAGED = 6  # steps of the second phase
-TINY = 1e-12  # information in any units, as of a parameter in millions
-CLIFF = 30.0  # nats that a step of it may lose: Monte Carlo noise seldom explains more
-FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
 NOISE_SHARES = (1.0, 0.3, 0.1)  # of the transition's noise, from which climbs start
 ASTRAY = 3.0  # nats that the climb of the approximation may cost by the particle filter
 SPREAD = 0.1  # least information of a logarithm that steps are made with
@@ -750,48 +736,6 @@ def bounds_note(names: Sequence[str], values: dict[str, float], what: str) -> st
         f"{'it is' if one else 'they are'} fixed just inside ({values_at}, at a cost of {COST:g} "
         f"nats{'' if one else ' each'}), and standard errors of the others are conditional on that"
     )
-
-
-def stochastic_quasi_newton(
-    gradient: Callable[[np.ndarray], Point | None], z: np.ndarray, found: Point, h: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """(z, H, distance from the top in nats) where the climb from z (F,) ends.
-
-    gradient : value and gradient at a point, with noise; None where there are none. found : these
-    at z. h : (F, F) minus the second derivatives there, about.
-    """
-    value, g = found
-    size = 1.0
-    for _ in range(MOST_STEPS):
-        step = newton_step(g, h, TINY)
-        if 0.5 * g @ step < NEAR:
-            break
-        step *= size * _step_share(step)
-        new = gradient(z + step)
-        if new is None or new[0] < value - 3.0:  # beyond what Monte Carlo noise explains
-            size *= 0.4
-            if size < 0.01:
-                break
-            continue
-        h = bfgs_update(h, step, g - new[1])
-        z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
-    distance, size = np.inf, 1.0
-    for k in range(AVERAGED):
-        step = newton_step(g, h, TINY)
-        distance = 0.5 * float(g @ step)
-        step *= size * _step_share(step) / (k + 1.0)
-        new = gradient(z + step)
-        if new is None or new[0] < value - CLIFF:
-            size *= 0.4
-            continue
-        z, (value, g) = z + step, new
-    return z, h, distance
-
-
-def _step_share(step: np.ndarray) -> float:
-    """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
-    coordinate at all."""
-    return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
 
 
 def positive_definite(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:
