@@ -35,7 +35,8 @@ def test_the_others_make_room_for_what_was_given(r):
         assert np.all(chain["a"] < drawn)
         assert np.all(drawn < chain["b"])
     estimate = ssm.maximize(between(), DATA, fixed={"r": r}, objective="posterior", progress=False)
-    assert estimate.parameters["a"] < r < estimate.parameters["b"]
+    # The density of r grows as a comes near it: the maximum may be at r itself, as it rounds.
+    assert estimate.parameters["a"] <= r <= estimate.parameters["b"]
 
 
 @pytest.mark.parametrize(
