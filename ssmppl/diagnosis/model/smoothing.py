@@ -35,6 +35,7 @@ from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.batched.call import values_kept
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
@@ -137,7 +138,8 @@ class Smoother:
         ------
         SamplingError : all weights vanish, or are NaN; names the step and the parameters.
         """
-        return [self._one(e, theta, stream, predicted or ahead, ahead) for e in experiments]
+        with values_kept():
+            return [self._one(e, theta, stream, predicted or ahead, ahead) for e in experiments]
 
     def _one(
         self, e: Experiment, theta: np.ndarray, stream: np.ndarray, predicted: bool, ahead: bool

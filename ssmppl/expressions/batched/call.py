@@ -8,8 +8,8 @@ and arguments are computed together, by one call, wherever several of them are n
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
@@ -20,8 +20,8 @@ from ssmppl.expressions.batched.differences import HIGHEST, Index, Stencil
 from ssmppl.expressions.node import Expr
 
 OP = "simulator"
-KEPT = 1 << 18  # numbers in the points whose values are kept
-MOST_KEPT = 64  # points of a call beyond which none are: many particles seldom come again
+MOST_KEPT = 64  # points of a call beyond which no values are kept: many seldom come again
+_here = threading.local()
 
 
 class Batched(Protocol):
@@ -103,36 +103,24 @@ def groups(nodes: Iterable[Expr]) -> dict[Expr, tuple[Expr, ...]]:
 
 def computed(function: Any, wanted: tuple[Index, ...], x: np.ndarray) -> np.ndarray:
     """(len(wanted), outputs, B) at x (B, K)."""
-    stencil = stencil_of(wanted, x.shape[1])
-    known = _values.at(function, x) if len(x) <= MOST_KEPT else None
+    stencil, known = stencil_of(wanted, x.shape[1]), None
+    kept: dict[Any, dict[Any, np.ndarray]] | None = getattr(_here, "kept", None)
+    if kept is not None and len(x) <= MOST_KEPT:
+        key = function.name, np.ascontiguousarray(x).tobytes()
+        known = kept.setdefault(key, {})
     return stencil.derivatives(function.at, x, function.scales, known)
 
 
-class _Values:
-    """The latest values of functions, by their points: the parts of a law that are compiled apart
-    ask for the same ones, one after the other."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.kept: OrderedDict[tuple[str, bytes], dict[Any, np.ndarray]] = OrderedDict()
-        self.size = 0  # numbers among the keys, which bound those of the values
-
-    def at(self, function: Any, x: np.ndarray) -> dict[Any, np.ndarray]:
-        """Place of a stencil -> values at x (B, K); those that are found are put in there."""
-        key = function.name, np.ascontiguousarray(x).tobytes()
-        with self.lock:
-            found = self.kept.pop(key, None)
-            if found is None:
-                found = {}
-                self.size += x.size
-            self.kept[key] = found
-            while self.size > KEPT:
-                (_, old), _ = self.kept.popitem(last=False)
-                self.size -= len(old) // 8
-            return found
-
-
-_values = _Values()
+@contextmanager
+def values_kept() -> Iterator[None]:
+    """Within it this thread's values are kept by their points: parts of a law that are compiled
+    apart ask for the same ones, one after the other. Not for longer, as what the user's function
+    reads may be changed between calls."""
+    _here.kept = {}
+    try:
+        yield
+    finally:
+        del _here.kept
 
 
 def of_group(group: Sequence[Expr], args: Sequence[Any]) -> list[np.ndarray]:

@@ -165,7 +165,8 @@ def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = 
     """Slope, curvature and the next steps from the values at a stencil, that `move` led to."""
     if tells == SLOPES:
         assert move is not None
-        slope = _slopes(values, c.size)
+        up, down = np.split(values[1:], 2)
+        slope = _slopes(values[0], up, down, c.size)
         curvature = -_updated(c.information, move, c.slope - slope)
         c.stale = not np.all(np.isfinite(slope))
     else:
@@ -183,13 +184,11 @@ def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = 
     c.size = np.clip(wanted, SHORTEST, LONGEST)
 
 
-def _slopes(values: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """(F,) from the values at a stencil of `SLOPES`, on one side where the other has none."""
-    n = len(size)
-    up, down = values[1 : 1 + n], values[1 + n : 1 + 2 * n]
+def _slopes(middle: float, up: np.ndarray, down: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """(F,) from the values at both sides, on one side where the other has none."""
     with np.errstate(invalid="ignore"):
-        one_sided = np.where(np.isfinite(up), up - values[0], values[0] - down) / size
-        both = (up - down) / (2.0 * size)
+        one_sided = np.where(np.isfinite(up), up - middle, middle - down) / h
+        both = (up - down) / (2.0 * h)
     return np.where(np.isfinite(both), both, one_sided)
 
 
@@ -220,9 +219,7 @@ def derivatives(values: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.nd
             own = values[1 + k * each : 1 + (k + 1) * each]
             up, down = own[:n], own[n : 2 * n]
             alone = up - 2.0 * values[0] + down
-            slope = (up - down) / (2.0 * h)
-            one_sided = np.where(np.isfinite(up), up - values[0], values[0] - down) / h
-            slopes.append(np.where(np.isfinite(slope), slope, one_sided))
+            slopes.append(_slopes(values[0], up, down, h))
             curve = np.diag(alone / h**2)
             ahead, back = own[2 * n : 2 * n + pairs], own[2 * n + pairs :]
             for p, (i, j) in enumerate(zip(*np.tril_indices(n, -1), strict=True)):

@@ -288,3 +288,20 @@ class TestOtherProcesses:
         model, options = model_of(locked), {"draws": 5, "warmup": 5, "chains": 1}
         with ProcessPoolExecutor(1) as pool, pytest.raises(ssm.SSMError, match="lock"):
             ssm.sample(model, DATA, executor=pool, progress=False, **options)
+
+
+def test_what_the_function_reads_may_change_between_calls():
+    """Values are kept within a pass of a diagnosis only: a constant that is changed counts."""
+    constants = {"g": 1.0}
+
+    def moved(state, inputs, parameters):
+        q, v = state.T
+        v = v + 0.1 * (inputs[:, 0] - constants["g"] * parameters[:, 0] * q)
+        return np.stack([q + 0.1 * v, v], axis=1)
+
+    model = model_of(ssm.simulator(state=["q", "v"], inputs=["u"], parameters=["k"])(moved))
+    first = ssm.log_likelihood(model, DATA, AT, proposal="extended")
+    constants["g"] = 2.0
+    assert ssm.log_likelihood(model, DATA, AT, proposal="extended") != first
+    constants["g"] = 1.0
+    assert ssm.log_likelihood(model, DATA, AT, proposal="extended") == first
