@@ -3,6 +3,11 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How long examples take to draw depends on what else the machine does: no test is timed.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 # A shell without job control starts its background jobs with Ctrl-C ignored; the tests of
 # interrupts would wait for ever.
