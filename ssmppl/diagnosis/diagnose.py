@@ -60,7 +60,7 @@ BY_EXTENDED = (
     "The model calls a simulator: likelihoods, and the states behind the scores, are those of an "
     "extended Kalman filter, which is an approximation."
 )
-SETS = {"fast": 100, "full": 200}  # simulated data sets
+SETS = {"fast": 100, "full": 200}  # simulated data sets; of a simulator 100 in both
 PARTICLES = {"fast": 500, "full": 1000}
 TWISTED_PARTICLES = {"fast": 100, "full": 100}  # a few that know where to go do more
 
@@ -149,6 +149,7 @@ class _Diagnosis:
         if mode == "full" and long_enough(self.experiments):
             self.split = three_parts(self.experiments)
         self.called = bool(simulators(self.trace))
+        self.sets = SETS["fast" if self.called else mode]
         missing = self.problem.program.missing
         if mode == "full" and self.split is None:  # blocks of rows will be set missing
             missing = replace(missing, none=False)
@@ -165,7 +166,7 @@ class _Diagnosis:
         self.notes += [BY_EXTENDED] * self.called
         described = {
             "alpha": alpha, "seed": self.root.entropy, "fixed": self.fixed, "particles": number,
-            "sets": SETS[mode],
+            "sets": self.sets,
         }  # fmt: skip
         made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
         # Threads that wait for one simulator take turns, which takes longer than one alone.
@@ -224,7 +225,7 @@ class _Diagnosis:
         with self.failures.guard("the time that is expected"):
             self._tell_time(base, fit, design, training)
         screen = run_screen(
-            design, training, fit.theta, SETS[self.mode], self._seed(Stage.SCREEN), self.checkpoint
+            design, training, fit.theta, self.sets, self._seed(Stage.SCREEN), self.checkpoint
         )
         settings = {
             "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
@@ -354,8 +355,8 @@ class _Diagnosis:
         self, base: Fitter, fit: Fit, design: ScreenDesign, experiments: Sequence[Experiment]
     ) -> None:
         """Show how long the mode will take, from passes over the data."""
-        done = sum(f"screening/{k}" in self.checkpoint for k in range(SETS[self.mode]))
-        if not self.checkpoint.progress or done > SETS[self.mode] // 2:
+        done = sum(f"screening/{k}" in self.checkpoint for k in range(self.sets))
+        if not self.checkpoint.progress or done > self.sets // 2:
             return
         whole, runs = design.theta(fit.theta), itertools.count()
 
@@ -370,7 +371,7 @@ class _Diagnosis:
         of_climbs = base.seconds_of_value(experiments, fit.theta)
         blocks = 0 if self.split else FOLDS
         rest = expected(
-            Timed(for_screen, for_fit, generating, of_climbs), SETS[self.mode], self.mode, blocks,
+            Timed(for_screen, for_fit, generating, of_climbs), self.sets, self.mode, blocks,
             self.checkpoint.executor, simulator=self.called,
         )  # fmt: skip
         self.checkpoint.say(f"{self.mode} mode: {in_words(rest)} expected from here on")

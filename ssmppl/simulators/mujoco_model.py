@@ -72,6 +72,43 @@ def _ignore(text: Any) -> None:
 _silence = _Silence()
 
 
+class _Batch:
+    """A batch of the engine with its arrays at hand, which stay the same ones; parameters : bytes
+    of those that its models have."""
+
+    def __init__(self, batch: Any, start: np.ndarray, control: np.ndarray, force: np.ndarray):
+        self.batch, self.start, self.control, self.force = batch, start, control, force
+        self.qpos, self.qvel, self.act, self.ctrl, self.pushed = (
+            batch.bind(n) for n in ("qpos", "qvel", "act", "ctrl", "qfrc_applied")
+        )
+        self.state, self.warning = batch.state, batch.warning
+        self.warned = self.warning[:, :, 1]
+        self.sensors: np.ndarray | None = None
+        self.parameters: bytes | None = None
+
+    def load(self, state: np.ndarray, inputs: np.ndarray, why: Mapping[int, str]) -> None:
+        """States and inputs, and all else as it is at the beginning; this alone where `why`."""
+        self.state[:] = self.start
+        n, m = self.qpos.shape[1], len(self.control)
+        self.qpos[:] = state[:, :n]
+        self.qvel[:] = state[:, n : 2 * n]
+        self.act[:] = state[:, 2 * n :]
+        self.ctrl[:, self.control] = inputs[:, :m]
+        self.pushed[:, self.force] = inputs[:, m:]
+        self.warning[:] = 0
+        if why:
+            self.state[list(why)] = self.start
+
+    def moved(self) -> np.ndarray:
+        """The states after a step."""
+        return np.concatenate([self.qpos, self.qvel, self.act], axis=1)
+
+    def sensed(self, sensor: np.ndarray) -> np.ndarray:
+        """These numbers of the sensors."""
+        assert self.sensors is not None
+        return np.array(self.sensors[:, sensor])
+
+
 class MujocoModel(Engine):
     """A MuJoCo model that moves a batch; `output` gives its sensors.
 
@@ -217,80 +254,67 @@ class MujocoModel(Engine):
         if not size:
             return np.empty((0, width)), {}
         with self._lock:
-            why = {
-                int(k): "an argument is not finite"
-                for part in (state, inputs, parameters)
-                for k in np.flatnonzero(~np.isfinite(part).all(axis=1))
-            }
+            why: dict[int, str] = {}
+            for part in (state, inputs, parameters):
+                if not np.isfinite(part).all():
+                    bad = np.flatnonzero(~np.isfinite(part).all(axis=1))
+                    why |= {int(k): "an argument is not finite" for k in bad}
             batch = self._batch(size)
             self._set_models(batch, parameters, why)
-            self._load(batch, state, inputs, why)
+            batch.load(state, inputs, why)
             ids = np.array([k for k in range(size) if k not in why], dtype=int) if why else None
             if ids is None or len(ids):
                 with _silence.within(self.engine):
                     self._advance(batch, ids, sense, why)
-            if sense:
-                found = np.array(batch.bind("sensordata")[:, self._sensor])
-            else:
-                found = np.concatenate(
-                    [batch.bind("qpos"), batch.bind("qvel"), batch.bind("act")], axis=1
-                )
-        found[list(why)] = np.nan
+            found = batch.sensed(self._sensor) if sense else batch.moved()
+        if why:
+            found[list(why)] = np.nan
         return found, why
 
-    def _batch(self, size: int) -> Any:
+    def _batch(self, size: int) -> _Batch:
         if size not in self._batches:
-            self._batches[size] = self._batched.Batch(self.model, size, self.threads)
+            made = self._batched.Batch(self.model, size, self.threads)
+            self._batches[size] = _Batch(made, self._start, self._control, self._force)
             if len(self._batches) > BATCHES:
                 self._batches.popitem(last=False)
         self._batches.move_to_end(size)
         return self._batches[size]
 
-    def _load(
-        self, batch: Any, state: np.ndarray, inputs: np.ndarray, why: Mapping[int, str]
-    ) -> None:
-        batch.state[:] = self._start
-        n = self.model.nq
-        batch.bind("qpos")[:] = state[:, :n]
-        batch.bind("qvel")[:] = state[:, n : 2 * n]
-        batch.bind("act")[:] = state[:, 2 * n :]
-        m = len(self._control)
-        batch.bind("ctrl")[:, self._control] = inputs[:, :m]
-        batch.bind("qfrc_applied")[:, self._force] = inputs[:, m:]
-        batch.warning[:] = 0
-        batch.state[list(why)] = self._start
-
-    def _advance(self, batch: Any, ids: Any, sense: bool, why: dict[int, str]) -> None:
+    def _advance(self, batch: _Batch, ids: Any, sense: bool, why: dict[int, str]) -> None:
+        own = batch.batch
         try:
             if sense:
-                batch.bind("sensordata")
-                batch.forward(ids)
+                if batch.sensors is None:
+                    batch.sensors = own.bind("sensordata")
+                own.forward(ids)
             else:
-                batch.step(ids, nstep=self.substeps)
+                own.step(ids, nstep=self.substeps)
         except self._batched.SimulationError as error:
-            why |= {int(k): f"MuJoCo: {batch.error(int(k))}" for k in error.ids}
-        for k, kind in zip(*np.nonzero(batch.warning[:, :, 1]), strict=True):
-            why.setdefault(int(k), REASONS[kind] if kind < len(REASONS) else "MuJoCo warns")
+            why |= {int(k): f"MuJoCo: {own.error(int(k))}" for k in error.ids}
+        if batch.warned.any():
+            for k, kind in zip(*np.nonzero(batch.warned), strict=True):
+                why.setdefault(int(k), REASONS[kind] if kind < len(REASONS) else "MuJoCo warns")
 
     # -- models of parameters
-    def _set_models(self, batch: Any, parameters: np.ndarray, why: dict[int, str]) -> None:
+    def _set_models(self, batch: _Batch, parameters: np.ndarray, why: dict[int, str]) -> None:
         if not self.parameters:
             return
+        rows = np.ascontiguousarray(parameters, dtype=float)
+        whole = rows.tobytes()
+        if whole == batch.parameters and not why:
+            return
+        width = rows.shape[1] * rows.itemsize
+        keys = [whole[k * width : (k + 1) * width] for k in range(len(rows))]
         own: dict[bytes, Any] = {}
         models = []
-        for k, row in enumerate(np.ascontiguousarray(parameters, dtype=float)):
-            if k in why:
-                models.append(self.model)
-                continue
-            key = row.tobytes()
-            if key not in own:
-                own[key] = self._model_of(key, row)
-            if isinstance(own[key], str):
+        for k, key in enumerate(keys):
+            if k not in why and key not in own:
+                own[key] = self._model_of(key, rows[k])
+            if k not in why and isinstance(own[key], str):
                 why[k] = own[key]
-                models.append(self.model)
-            else:
-                models.append(own[key])
-        batch.set_models(models)
+            models.append(self.model if k in why else own[key])
+        batch.batch.set_models(models)
+        batch.parameters = None if why else whole
 
     def _model_of(self, key: bytes, row: np.ndarray) -> Any:
         """The model of a vector of parameters, or why there is none."""

@@ -35,8 +35,8 @@ from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.expressions.batched.call import values_kept
-from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.batched.call import OP, thriftily
+from ssmppl.expressions.expr import Expr, topological
 from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
 from ssmppl.inference.particles.backward import ParticleSystem, particle_system
@@ -50,14 +50,15 @@ from ssmppl.language.model.trace import Site, Trace, symbols
 LAG = 40  # rows of the fixed-lag smoother
 DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
 CALLED = 4  # trajectories where a simulator is called, mirrored too
-PREDICTIVE = 128  # draws behind a prediction under the twisted proposal
-PREDICTIVE_CALLED = 32  # likewise, where a simulator is called
+PREDICTIVE = 128  # draws behind a prediction under the twisted proposal, and of a simulator
+PREDICTIVE_CALLED = 32  # likewise, where a simulator gives what is observed
 
 # Of predictions further ahead.
 HORIZONS = (1, 10, 100)  # rows
 ORIGINS = 40  # rows that are simulated on from, spread evenly
 ORIGINS_CALLED = 8  # likewise, where a simulator is called; all far enough from the end
 CRPS_DRAWS = 24  # from each
+CRPS_DRAWS_CALLED = 8  # likewise, where a simulator is called: the score is fair for any number
 FEWEST = 8  # of these rows, without which a horizon is left out (0 in every data set)
 
 
@@ -138,7 +139,7 @@ class Smoother:
         ------
         SamplingError : all weights vanish, or are NaN; names the step and the parameters.
         """
-        with values_kept():
+        with thriftily():
             return [self._one(e, theta, stream, predicted or ahead, ahead) for e in experiments]
 
     def _one(
@@ -164,8 +165,11 @@ class Smoother:
             found, weights, ancestors = _as_particles(paths)
             increments = filtered.increments
             if predicted:
-                known = _drawn(filtered.mean, filtered.covariance, stream, PREDICTIVE_CALLED)
-                self.module.row_predictions(given, *data, *known, stream, prediction)
+                states, weights_ = _drawn(
+                    filtered.predicted, filtered.predicted_covariance, stream, self._predictive
+                )
+                self.module.row_predictions_at(given, *data, states, weights_, prediction)
+                known = _drawn(filtered.mean, filtered.covariance, stream, CRPS_DRAWS_CALLED)
         else:
             system, weights = self.system(e, own, stream)
             found, ancestors, increments = system.particles, system.ancestors, system.log_increments
@@ -184,7 +188,10 @@ class Smoother:
             if isinstance(self.extended, Extended):
                 last = max(e.steps - 1 - max(HORIZONS), e.steps // 2)
                 origins = spread_evenly(min(last, e.steps - 2), ORIGINS_CALLED)
-            scores = crps_ahead(self.program, e, own, *known, stream, feedback, origins)
+            draws = known[1].shape[1] if isinstance(self.extended, Extended) else CRPS_DRAWS
+            scores = crps_ahead(
+                self.program, e, own, *known, stream, feedback, origins, draws=draws
+            )
         return Pass(increments, rows, prediction, scores, together)
 
     def system(
@@ -218,6 +225,14 @@ class Smoother:
         if moments is None:
             return system.particles, system.weights
         return _drawn(*moments, stream)
+
+    @once_property
+    def _predictive(self) -> int:
+        """Draws behind a prediction of a model that calls a simulator."""
+        sites = self.columns.base.observations.values()
+        roots = [e for s in sites for e in s.distribution.expressions()]
+        called = any(n.op == OP for n in topological(roots))
+        return PREDICTIVE_CALLED if called else PREDICTIVE
 
     @property
     def _gaussian(self) -> GaussianApproximation:
@@ -303,7 +318,7 @@ def spread_evenly(last: int, most: int) -> np.ndarray:
 def crps_ahead(
     program: Program, e: Experiment, theta: np.ndarray, particles: np.ndarray, weights: np.ndarray,
     stream: np.ndarray, feedback: bool, origins: np.ndarray | None = None,
-    horizons: Sequence[int] = HORIZONS,
+    horizons: Sequence[int] = HORIZONS, draws: int = CRPS_DRAWS,
 ) -> np.ndarray:  # fmt: skip
     """(O, H, K) CRPS of each channel at each horizon, from the rows `origins` (O,) on, by
     default `ORIGINS` of them; NaN where nothing was observed, or the record ends before.
@@ -317,16 +332,16 @@ def crps_ahead(
     if steps < 2:
         return np.full((len(origins), len(horizons), channels), np.nan)
     levels = np.empty(1)
-    samples = np.full((len(origins), len(horizons), channels, CRPS_DRAWS), np.nan)
+    samples = np.full((len(origins), len(horizons), channels, draws), np.nan)
     known = np.isfinite(particles[origins]).all(axis=(1, 2))  # not a flat start before it is
     for o, t in enumerate(origins.tolist()):
         if not known[o] or (feedback and not np.all(e.seen[t] == 1.0)):
             continue
         fill_uniform(stream, levels)
-        chosen = _systematic(weights[t], float(levels[0]))
+        chosen = _systematic(weights[t], float(levels[0]), draws)
         reach = min(max(horizons), steps - 1 - t)
-        states = np.empty((reach, particles.shape[1], CRPS_DRAWS))
-        drawn = np.empty((reach, channels, CRPS_DRAWS))
+        states = np.empty((reach, particles.shape[1], draws))
+        drawn = np.empty((reach, channels, draws))
         start = np.ascontiguousarray(particles[t][:, chosen])
         y = e.y.copy() if feedback else e.y
         simulate(theta, y, e.seen, e.u, t + 1, start, stream, states, drawn, feedback)
@@ -339,10 +354,10 @@ def crps_ahead(
     return crps(samples, np.where(measured, e.y[inside], np.nan))
 
 
-def _systematic(weights: np.ndarray, level: float) -> np.ndarray:
-    """Indices of `CRPS_DRAWS` particles, drawn by their weights with one uniform."""
+def _systematic(weights: np.ndarray, level: float, draws: int) -> np.ndarray:
+    """Indices of so many particles, drawn by their weights with one uniform."""
     cumulative = np.cumsum(weights)
-    points = (np.arange(CRPS_DRAWS) + level) / CRPS_DRAWS * cumulative[-1]
+    points = (np.arange(draws) + level) / draws * cumulative[-1]
     return np.minimum(np.searchsorted(cumulative, points), len(weights) - 1)
 
 

@@ -34,6 +34,7 @@ from ssmppl.diagnosis.selection.densities import best_of_many, densities_of, den
 from ssmppl.diagnosis.selection.noisy_ascent import NEAR, stochastic_quasi_newton
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.arrays import array
+from ssmppl.expressions.batched.call import thriftily
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
@@ -42,6 +43,7 @@ from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.batched_newton import climb_together
+from ssmppl.inference.optimisation.batched_newton import information_at as information_of_many
 from ssmppl.inference.optimisation.newton import (
     GOOD,
     Top,
@@ -271,7 +273,7 @@ class Fitter:
         smooth = self._extended_log_likelihood(problem)
         many = self._extended_of_many(problem)
         if smooth is not None and many is not None:
-            return self._fit_together(space, smooth, many, seed, effort)
+            return self._fit_together(space, smooth, many, seed, effort, information)
         if effort.pilot:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
@@ -348,20 +350,27 @@ class Fitter:
         if isinstance(found, NotApplicable) or self.settings.proposal != "twisted":
             return None
         shift = len(problem.experiments) * self.log_correction
-        return lambda theta: found.log_likelihoods(problem.experiments, theta) + shift
+
+        def values(theta: np.ndarray) -> np.ndarray:
+            with thriftily():  # climbs look at differences that are far larger than its error
+                return found.log_likelihoods(problem.experiments, theta) + shift
+
+        return values
 
     def _fit_together(
         self, space: Space, smooth: Callable[[np.ndarray], float],
         many: Callable[[np.ndarray], np.ndarray], seed: np.random.SeedSequence, effort: Effort,
+        information: np.ndarray | None,
     ) -> Fit:  # fmt: skip
-        """The top of the extended filter's likelihood, whose points are looked at together."""
+        """The top of the extended filter's likelihood, whose points are looked at together; from a
+        start near it to within what a decision needs."""
         z = space.z[space.positions]
         densities = densities_of(space, many)
         starts = z[None]
         if effort.pilot:
             begun = [self._with_process_noise(space, share) for share in NOISE_SHARES[1:]]
             starts = best_of_many(densities, [z, *(s.z[s.positions] for s in begun)], seed)
-        found = climb_together(densities, starts, precise=not effort.approximate)
+        found = climb_together(densities, starts, effort.pilot, information)
         if found is None:
             raise ArgumentError(
                 "the extended Kalman filter comes to no number at every point that was tried",
@@ -611,11 +620,28 @@ class Fitter:
                 inside = found[free]
                 if np.all(np.isfinite(inside)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
                     return replace(fit, information=found)
+        many = self._extended_of_many(fit.problem)
+        if many is not None:
+            found = np.full_like(fit.information, np.nan)
+            found[free] = self._curvature(fit, many)
+            if np.all(np.isfinite(found[free])):
+                return replace(fit, information=found)
         try:
             found = self._simulated_information(fit.space, fit.theta, seed)
         except SamplingError:  # then there are no standard errors
             found = np.full_like(fit.information, np.nan)
         return replace(fit, information=found)
+
+    def _curvature(self, fit: Fit, many: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """(F', F') minus the second derivatives at the fit in what is not at a bound."""
+        free, densities = ~fit.at_bound, densities_of(fit.space, many)
+
+        def inside(points: np.ndarray) -> np.ndarray:
+            z = np.repeat(fit.z[None], len(points), axis=0)
+            z[:, free] = points
+            return densities(z)
+
+        return information_of_many(inside, fit.z[free], fit.information[np.ix_(free, free)])
 
     def _second_derivatives(
         self, kalman: KalmanModel, fit: Fit, seed: np.random.SeedSequence

@@ -83,8 +83,8 @@ def too_high(node: Expr) -> bool:
 
 
 @lru_cache(maxsize=4096)
-def stencil_of(wanted: tuple[Index, ...], arguments: int) -> Stencil:
-    return Stencil.of(wanted, arguments)
+def stencil_of(wanted: tuple[Index, ...], arguments: int, few: bool = False) -> Stencil:
+    return Stencil.of(wanted, arguments, few)
 
 
 def groups(nodes: Iterable[Expr]) -> dict[Expr, tuple[Expr, ...]]:
@@ -103,19 +103,22 @@ def groups(nodes: Iterable[Expr]) -> dict[Expr, tuple[Expr, ...]]:
 
 def computed(function: Any, wanted: tuple[Index, ...], x: np.ndarray) -> np.ndarray:
     """(len(wanted), outputs, B) at x (B, K)."""
-    stencil, known = stencil_of(wanted, x.shape[1]), None
     kept: dict[Any, dict[Any, np.ndarray]] | None = getattr(_here, "kept", None)
+    stencil, known = stencil_of(wanted, x.shape[1], kept is not None), None
     if kept is not None and len(x) <= MOST_KEPT:
         key = function.name, np.ascontiguousarray(x).tobytes()
         known = kept.setdefault(key, {})
-    return stencil.derivatives(function.at, x, function.scales, known)
+    found = stencil.derivatives(function.at, x, function.scales, known)
+    if kept is not None and not np.isfinite(found).all():  # the one side may have no value
+        return stencil_of(wanted, x.shape[1]).derivatives(function.at, x, function.scales, known)
+    return found
 
 
 @contextmanager
-def values_kept() -> Iterator[None]:
-    """Within it this thread's values are kept by their points: parts of a law that are compiled
-    apart ask for the same ones, one after the other. Not for longer, as what the user's function
-    reads may be changed between calls."""
+def thriftily() -> Iterator[None]:
+    """Within it this thread's derivatives are by few points (`differences.py`), and values are kept
+    by their points: parts of a model that are compiled apart ask for the same ones, one after the
+    other. Not for longer, as what the user's function reads may be changed between calls."""
     _here.kept = {}
     try:
         yield

@@ -3,8 +3,9 @@ one.
 
 Value, gradient and second derivatives are differences over one set of points, and the shares of a
 step are tried together with the differences at its whole, so that a step that climbs costs one
-call. Second derivatives take many points: they are taken where a climb starts, where a step led
-nowhere, and at the top; between these the slopes update them (`newton.bfgs_update`). Several climbs
+call. Second derivatives take many points: they are taken where a climb starts and they are not
+given, where a step led nowhere, and at the top; between these the slopes update them
+(`newton.bfgs_update`). Several climbs
 go on side by side in the same calls. Where the function is not concave, eigenvalues count by their
 size (`newton.newton_step`).
 """
@@ -60,11 +61,15 @@ class Climber:
         return Top(self.z, self.value, self.information, self.distance)
 
 
-def climb_together(function: Function, starts: np.ndarray, precise: bool = True) -> Climber | None:
+def climb_together(
+    function: Function, starts: np.ndarray, precise: bool = True,
+    information: np.ndarray | None = None,
+) -> Climber | None:  # fmt: skip
     """The highest of the climbs from starts (K, F); None where none has a value.
 
     precise : to the very top, with the second derivatives there; else to within `NEAR`, with what
         the climb has made of them.
+    information : (F, F) minus the second derivatives, about, where it starts; None: by differences.
 
     Ctrl-C is left to the caller, who sees every point that the function is asked for.
     """
@@ -77,6 +82,10 @@ def climb_together(function: Function, starts: np.ndarray, precise: bool = True)
     ]
     if not climbers:
         return None
+    if information is not None:
+        for c in climbers:
+            c.information, c.stale = information.copy(), False
+            c.size = _sizes(information)
     _differentiate(function, climbers)
     further = LATE
     for _ in range(STEPS):
@@ -124,6 +133,7 @@ def _step(function: Function, climbers: list[Climber]) -> None:
         if k == 0:
             _take(c, stencil, c.tells, move)
         else:
+            c.stale = True
             later.append(c)
     if later:
         _differentiate(function, later)
@@ -131,8 +141,6 @@ def _step(function: Function, climbers: list[Climber]) -> None:
 
 def _differentiate(function: Function, climbers: list[Climber]) -> None:
     """The derivatives of each where it stands."""
-    for c in climbers:
-        c.stale = True
     sets = [_stencil(c.z, c.size, c.tells) for c in climbers]
     found = function(np.array([z for own in sets for z in own]))
     for c, values in zip(
@@ -164,10 +172,11 @@ def _moved(z: np.ndarray, by: dict[int, float]) -> np.ndarray:
 def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = None) -> None:
     """Slope, curvature and the next steps from the values at a stencil, that `move` led to."""
     if tells == SLOPES:
-        assert move is not None
         up, down = np.split(values[1:], 2)
         slope = _slopes(values[0], up, down, c.size)
-        curvature = -_updated(c.information, move, c.slope - slope)
+        curvature = -c.information
+        if move is not None:
+            curvature = -_updated(c.information, move, c.slope - slope)
         c.stale = not np.all(np.isfinite(slope))
     else:
         slope, curvature = derivatives(values, c.size)
@@ -178,10 +187,24 @@ def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = 
     step = newton_step(c.slope, c.information)
     c.distance = 0.5 * float(c.slope @ step)
     c.ended = c.distance < GOOD and tells == FINE and not missing.any()
-    with np.errstate(divide="ignore"):
-        wanted = WIDTH / np.sqrt(np.abs(np.diagonal(c.information)))
-    wanted = np.where(missing, 0.1 * c.size, wanted)
+    wanted = np.where(missing, 0.1 * c.size, _sizes(c.information))
     c.size = np.clip(wanted, SHORTEST, LONGEST)
+
+
+def _sizes(information: np.ndarray) -> np.ndarray:
+    """(F,) of the differences, in standard deviations by this (F, F)."""
+    with np.errstate(divide="ignore"):
+        wanted = WIDTH / np.sqrt(np.abs(np.diagonal(information)))
+    return np.clip(wanted, SHORTEST, LONGEST)
+
+
+def information_at(function: Function, z: np.ndarray, about: np.ndarray) -> np.ndarray:
+    """Minus the second derivatives (F, F) at z (F,), in one call; NaN where there are none.
+
+    about : (F, F) what they are, roughly, for the steps of the differences.
+    """
+    size = _sizes(about)
+    return -derivatives(function(np.array(_stencil(z, size, FINE))), size)[1]
 
 
 def _slopes(middle: float, up: np.ndarray, down: np.ndarray, h: np.ndarray) -> np.ndarray:

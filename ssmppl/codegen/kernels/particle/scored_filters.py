@@ -212,6 +212,19 @@ def row_predictions(
 
 
 @exact
+def row_predictions_at(prepare, step, moments, sizes, theta, y, seen, u, particles, weights, out):
+    """Likewise, of particles (T, D, N) that are given y_{1:t-1} already."""
+    n_steps, _, n = particles.shape
+    c, s = np.empty(sizes[0]), np.empty(sizes[1])
+    given_each = np.empty((4 * y.shape[1], n))
+    prepare(theta, c)
+    for t in range(n_steps):
+        step(theta, c, y, seen, u, t, s)
+        moments(theta, c, s, particles[t], given_each)
+        mix_channels(given_each, weights[t], out[t])
+
+
+@exact
 def complete_rows(begin, follow, prepare, step, sizes, theta, y, seen, u, particles, ancestors):
     """Set the components that follow from the others, along the ancestors (T, N).
 
