@@ -100,7 +100,7 @@ def input_twice():
     return Model("m", inputs=("u", "u"))  # HERE
 
 
-@bad("stands on 3", "no function", "without parentheses")
+@bad("decorates 3", "not a function", "without parentheses")
 def decorator_on_a_number():
     model = Model("m")
     model.prior(3)  # HERE
@@ -303,7 +303,7 @@ def state_named_as_a_parameter():
     return declare(initial=initial)
 
 
-@bad("'x' is given by two @transition functions", "one law")
+@bad("'x' is given by two @transition functions", "one distribution")
 def state_with_two_transitions():
     def again(x):  # HERE
         return {"x": ssm.Normal(x, sd=1)}
@@ -311,7 +311,7 @@ def state_with_two_transitions():
     return declare(transition=[GOOD["transition"], again])
 
 
-@bad("state 'v' has an initial law but no transition", "the transitions give: x")
+@bad("state 'v' has an initial distribution but no transition", "the transitions give: x")
 def state_without_transition():
     def initial():
         return {
@@ -322,7 +322,7 @@ def state_without_transition():
     return declare(initial=initial)
 
 
-@bad("@transition gives 'v', which has no initial law", "@initial gives: x")
+@bad("@transition gives 'v', which has no initial distribution", "@initial gives: x")
 def state_without_initial_law():
     def transition(x):
         return {
@@ -374,7 +374,7 @@ def discrete_prior():
     return declare(prior=prior)
 
 
-@bad("the law of 'x' is Flat, which is improper", "as a prior")
+@bad("the distribution of 'x' is Flat, which is improper", "as a prior")
 def flat_state():
     def transition(x):
         return {"x": ssm.Flat()}  # HERE
@@ -382,7 +382,7 @@ def flat_state():
     return declare(transition=transition)
 
 
-@bad("the law of 'x' is HalfFlat, which is improper", "as a prior")
+@bad("the distribution of 'x' is HalfFlat, which is improper", "as a prior")
 def half_flat_start():
     def initial():
         return {"x": ssm.HalfFlat()}  # HERE
@@ -398,7 +398,7 @@ def observation_without_noise():
     return declare(observation=observation)
 
 
-@bad("@proposal gives no law for the state 'v'", "it gives: x")
+@bad("@proposal gives no distribution for the state 'v'", "it gives: x")
 def proposal_for_one_state_only():
     def proposal(x):  # HERE
         return {"x": ssm.Normal(x, sd=1)}
@@ -651,7 +651,7 @@ def index_out_of_range():
     return declare(initial=lambda: {"x": ssm.Normal(np.zeros(2), sd=1)}, transition=transition)
 
 
-@bad("another law when it is called again", "no random numbers")
+@bad("another distribution when it is called again", "no random numbers")
 def random_numbers_inside():
     def transition(x):
         noise = random.gauss(0, 1)
@@ -701,7 +701,7 @@ def sum_over_a_number():
     return declare(transition=transition)
 
 
-@bad("formats a symbol", "out of the law")
+@bad("formats a symbol", "out of the distribution")
 def formatted_symbol():
     def transition(x):
         return {"x": ssm.Normal(float(f"{x:.2f}"), sd=1)}  # HERE

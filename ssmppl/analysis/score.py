@@ -121,7 +121,8 @@ class CompleteScore:
             for node in topological(roots):  # the first of them
                 if jumps(node) and node in changing:
                     return NotApplicable(
-                        f"the law of {site.name} changes by steps in {parameter!r}, by {node!r}",
+                        f"the distribution of {site.name} changes by steps in {parameter!r}, by "
+                        f"{node!r}",
                         where,
                     )
         return None

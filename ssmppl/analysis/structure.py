@@ -281,7 +281,7 @@ def _gaussian_law(
     for site in sites:
         d = site.distribution
         if not isinstance(d, (Normal, MvNormal, Dirac)) and type(d) is not Flat:
-            reason = f"the {role} law of {site.name} is {type(d).__name__}"
+            reason = f"the {role} distribution of {site.name} is {type(d).__name__}"
             return NotApplicable(reason, d.location)
     block = gaussian_block(sites, dirac=True)
     if block.late:
@@ -296,7 +296,7 @@ def _gaussian_law(
 def singular_covariance(trace: Trace) -> NotApplicable | None:
     """Why the states have no joint density beside their Dirac components: a covariance that is
     singular whatever the parameters are, or in some cases of the conditions in it."""
-    for role, sites in (("initial law", trace.initial), ("transition", trace.transition)):
+    for role, sites in (("initial distribution", trace.initial), ("transition", trace.transition)):
         for site in sites.values():
             if isinstance(site.distribution, MvNormal) and site.distribution.root is not None:
                 rank = sum(any(e is not constant(0.0) for e in column)
@@ -336,9 +336,9 @@ def check_start(trace: Trace) -> None:
     reason = linear_gaussian(trace) if flat and trace.observations else None
     if isinstance(reason, NotApplicable):
         raise ModelError(
-            f"the initial law of {flat[0].name!r} is Flat, which only a linear Gaussian model may "
-            f"have, and this one is none: {reason}",
-            fix="give it a proper law; a vague one is one of large spread",
+            f"the initial distribution of {flat[0].name!r} is Flat, which only a linear Gaussian "
+            f"model may have, and this one is none: {reason}",
+            fix="give it a proper distribution; a vague one is one of large spread",
             where=flat[0].distribution.location,
         )
 
@@ -346,7 +346,7 @@ def check_start(trace: Trace) -> None:
 def without_noise(trace: Trace) -> NotApplicable | None:
     """None if every state follows from parameters, inputs and earlier observations, at t = 1 too;
     else which one does not."""
-    for role, sites in (("initial law", trace.initial), ("transition", trace.transition)):
+    for role, sites in (("initial distribution", trace.initial), ("transition", trace.transition)):
         for site in sites.values():
             if not isinstance(site.distribution, Dirac):
                 kind = type(site.distribution).__name__

@@ -57,10 +57,14 @@ INTEGRATED = {name: SAMPLERS[name] for name in ("mh", "pmmh", "smc2")}
     "Metropolis-Hastings (mh) or Gibbs. By particles: Metropolis-Hastings (pmmh), Gibbs (pgas), "
     "SMC^2 (smc2). [default: chosen by the model]",
 )  # fmt: skip
-@option("--particles", type=int, help="Number of particles [default: tuned].")
+@option(
+    "--particles", type=int,
+    help="Number of particles [default: pmmh tuned; smc2 100; pgas 25, or 200 where ancestors "
+    "cannot be sampled].",
+)  # fmt: skip
 @SETTINGS
-@option("--draws", type=int, default=1000, section="Run", help="Kept draws of a chain.")
-@option("--warmup", type=int, default=1000, section="Run", help="Dropped ones before.")
+@option("--draws", type=int, default=1000, section="Run", help="Kept draws per chain.")
+@option("--warmup", type=int, default=1000, section="Run", help="Warmup draws per chain.")
 @option("--chains", type=int, default=4, section="Run", help="Number of chains.")
 @option("--thin", type=int, default=1, section="Run", help="Keep every thin-th draw.")
 @SEED
@@ -172,8 +176,8 @@ def _table(output: Path | None, table: Any) -> list[Path]:
 @NEEDED_DATA
 @option(
     "--method", type=MethodName(CLIMBERS),
-    help="How to climb: direct optimisation (do), score ascent, EM, its particle forms, iterated "
-    "filtering (if2) [default: chosen by the model].",
+    help="Optimisation method: direct optimisation (do), score ascent, EM, its particle forms, "
+    "iterated filtering (if2) [default: chosen by the model].",
 )  # fmt: skip
 @SETTINGS
 @option(
@@ -234,10 +238,10 @@ def maximize(
     help="Bridge sampling over the exact likelihood (mh) or its particle estimate (pmmh); or SMC^2 "
     "[default: mh where it applies, else pmmh].",
 )  # fmt: skip
-@option("--particles", type=int, help="Number of particles [default: tuned].")
+@option("--particles", type=int, help="Number of particles [default: pmmh tuned; smc2 100].")
 @SETTINGS
 @option("--draws", type=int, default=2000, section="Run", help="Draws of a chain.")
-@option("--warmup", type=int, default=1000, section="Run", help="Dropped ones before.")
+@option("--warmup", type=int, default=1000, section="Run", help="Warmup draws per chain.")
 @option("--chains", type=int, default=4, section="Run", help="Number of chains.")
 @SEED
 @FIXED

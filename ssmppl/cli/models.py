@@ -86,7 +86,7 @@ def compile(model: str, data: tuple[Path, ...], path: bool) -> None:
 @command("simulate", "Simulate states and observations.")
 @MODEL
 @option("--steps", type=int, section="Model and data",
-        help="Number of time steps; the inputs, if any, tell it too.")  # fmt: skip
+        help="Number of time steps [default: number of input rows].")  # fmt: skip
 @PARAMETERS
 @INPUTS
 @option("--draws", type=int, default=1, section="Run", help="Number of simulations.")

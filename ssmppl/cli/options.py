@@ -188,7 +188,7 @@ QUANTILES = option(
 )  # fmt: skip
 SEED = option(
     "--seed", type=int, section="Run",
-    help="The same seed gives the same numbers [default: drawn; --json tells it].",
+    help="The same seed gives the same numbers [default: drawn; shown with --json].",
 )  # fmt: skip
 PROGRESS = option(
     "--progress/--no-progress", default=True, section="Run",
@@ -196,8 +196,9 @@ PROGRESS = option(
 )  # fmt: skip
 PROPOSAL = option(
     "--proposal", default="auto", metavar="NAME", shell_complete=_proposals,
-    help=f"How particles move: {', '.join(PROPOSALS)}; `ssmppl explain` tells which there are. The "
-    f"last {len(APPROXIMATE)} are approximations of the likelihood, without particles.",
+    help=f"How particles move: {', '.join(PROPOSALS)}; those available are listed by "
+    f"`ssmppl explain`. The last {len(APPROXIMATE)} are approximations of the likelihood, without "
+    "particles.",
 )  # fmt: skip
 PARTICLE_FILTER = apply(
     option("--particles", type=int, default=1000, help="Number of particles."),

@@ -121,7 +121,7 @@ def predict(
 @POSTERIOR_OR_DATA
 @PARAMETERS
 @option("--steps", type=int, section="Model and data",
-        help="Number of rows; the inputs, if any, tell it too.")  # fmt: skip
+        help="Number of rows [default: number of input rows].")  # fmt: skip
 @INPUTS
 @option("--experiment", type=int, section="Model and data",
         help="Which one is continued, from 1, where several were sampled.")  # fmt: skip

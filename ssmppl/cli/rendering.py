@@ -75,7 +75,7 @@ def stop_interrupted(kept: str) -> NoReturn:
 
 def stop_in_part(failed: str) -> NoReturn:
     """The end of a command whose answer lacks parts, once what it has is written."""
-    note(f"{click.style('Answered in part:', fg='yellow')} {failed}")
+    note(f"{click.style('Incomplete result:', fg='yellow')} {failed}")
     raise click.exceptions.Exit(IN_PART)
 
 
@@ -186,9 +186,9 @@ def summary_lines(table: pd.DataFrame) -> str:
     ]
     notes = []
     if apart.any():
-        notes.append(f"r_hat above {HIGH_R_HAT}: the chains have not met, draw more")
+        notes.append(f"r_hat above {HIGH_R_HAT}: the chains have not converged, draw more")
     if few.any():
-        notes.append(f"ess below {LOW_ESS}: means and quantiles are rough, draw more or thin more")
+        notes.append(f"ess below {LOW_ESS}: Monte Carlo error is large, draw more or thin more")
     text = "\n".join([click.style(head, bold=True), *shown])
     return text + "".join(f"\nNote: {one}." for one in notes)
 

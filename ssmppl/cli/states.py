@@ -46,7 +46,7 @@ LABELS = {k: n if k == "laplace" else f"{n} (approximate)" for k, n in NAMES.ite
 
 FILE_OF_MOMENTS = output(
     "the name of the data file, with _filter.nc",
-    "netCDF file with all that the filter tells; named .csv or .parquet, the table.",
+    "netCDF file with all results of the filter; named .csv or .parquet, the table.",
 )
 
 
@@ -79,12 +79,12 @@ def particle_filter(
     _filtered(model, data, parameters, output, ssm.particle_filter, seed=seed, **settings)
 
 
-@command("kalman-filter", "The same exactly, where all is linear and Gaussian.")
+@command("kalman-filter", "Kalman filter (linear Gaussian models).")
 @MODEL
 @NEEDED_DATA
 @PARAMETERS
 @option("--proposal", type=click.Choice(["auto", "kalman", *APPROXIMATE]), default="auto",
-        help="auto is kalman, of a model with a simulator extended; kalman is exact, the others "
+        help="auto: kalman; extended if the model calls a simulator. kalman is exact, the others "
         "are approximations for states driven by Gaussian noise.")  # fmt: skip
 @QUANTILES
 @FILE_OF_MOMENTS
@@ -108,7 +108,7 @@ def kalman_filter(
               quantiles=quantiles)  # fmt: skip
 
 
-@command("forward-filter", "The same exactly, where states take few values.")
+@command("forward-filter", "Forward algorithm (finite-state models).")
 @MODEL
 @NEEDED_DATA
 @PARAMETERS

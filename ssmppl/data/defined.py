@@ -134,7 +134,7 @@ def _error(
     """first : row of the data where the arrays began that `found` was found in."""
     law, row = suspect.law, first + found.row
     whose = (
-        f"the {suspect.parameter} of {name_of(law)}, the law of {suspect.site.name!r} "
+        f"the {suspect.parameter} of {name_of(law)}, the distribution of {suspect.site.name!r} "
         f"({trace.locations.get(found.node, law.location)})"
     )
     node = found.node if found.index is None else found.index
@@ -148,7 +148,7 @@ def _error(
     if found.index is None:
         return DataError(
             f"{whose} is not a number: {to_text(node)}" + (f" at {here}" if here else ""),
-            fix="write the law for this value too, with np.where, or give another value",
+            fix="write the distribution for this value too, with np.where, or give another value",
             where=where,
         )
     value, last = found.value, found.elements - 1

@@ -1,4 +1,5 @@
-"""The sim-to-real gap: where a model differs from its data, which effect is missing, what it buys.
+"""The sim-to-real gap: where a model differs from its data, which effect is missing, and how
+much it improves held-out prediction.
 
 effects/    what an unmodelled effect is, the catalogue, candidates: effects bound to an equation
 model/      the equations of a model, effects added to them, score columns, one pass over the data

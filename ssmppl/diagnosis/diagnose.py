@@ -92,7 +92,11 @@ def diagnose(
         `@ssm.effect` that join it, or a mapping that renames; None: the whole catalogue.
     mode : "fast" stops after the screen; "full" refits, confirms on held-out rows and writes the
         augmented model.
-    alpha : family-wise error rate of every verdict.
+    alpha : family-wise error rate of the effects, below 0.5: the chance that a correct model is
+        said to lack one (in full mode half of it for the score tests, half for the refits). Places
+        and checks of the predictions have a fifth of it each, so that the chance of any finding on
+        a correct model is at most about 1.4 alpha; 1.6 alpha in fast mode, which also tests what
+        the catalogue leaves unexplained, at a fifth.
     fixed : values of known parameters.
     particles : of the particle filters; None: 500 in fast mode, 1000 in full mode, 100
         where the twisted proposal applies.
@@ -102,7 +106,7 @@ def diagnose(
         there and gives the same report. None: nothing is kept.
     progress : whether to show the stages and the time that they will take, on stderr.
     seed : the same seed gives the same report.
-    debug : the first fault of this package is raised, where else the part that it ended (a
+    debug : the first internal error is raised, where else the part that it ended (a
         candidate, a refit, a block, a table) is left out: see `GapReport.left_out`.
 
     Returns
@@ -158,8 +162,8 @@ class _Diagnosis:
         self.settings = Settings(number, proposal)
         self.augmented = AugmentedModels(self.trace, missing, self.fixed, self.settings)
         self.notes = [
-            f"The law of {n}, {type(s.distribution).__name__}, has no distribution function "
-            "(.cdf): its one-step predictions are not checked."
+            f"No CDF is defined for {n} ({type(s.distribution).__name__}): no PIT checks of its "
+            "one-step predictions."
             for n, s in self.trace.observations.items()
             if isinstance(s.distribution, UserDefined) and not s.distribution.has_cdf
         ]
@@ -281,8 +285,8 @@ class _Diagnosis:
             found.chosen, found.left_out = found.fewer.pop(), True
             add_standard_errors(found, self._seed(Stage.SELECTION), self.checkpoint)
             found.notes.append(
-                f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
-                f"held-out rows worse than the model itself ({gain:.1f} nats); kept instead: "
+                f"{' and '.join(map(str, last.candidates))} fit better together, and have lower "
+                f"held-out predictive density than the base model ({gain:.1f} nats); retained: "
                 + " and ".join(map(str, found.chosen.candidates))
             )
 

@@ -72,10 +72,11 @@ UNSUPPORTED: dict[str, str] = {
     "softmax": "np.exp(x) / np.sum(np.exp(x))",
     "log_softmax": "x - np.log(np.sum(np.exp(x)))",
     "log_expit": "-np.logaddexp(0, -x)",
-    "cdf": "scipy.special.ndtr(z) for a normal law, gammainc and betainc for gamma and beta laws",
-    "logcdf": "scipy.special.log_ndtr(z) for a normal law",
-    "sf": "scipy.special.ndtr(-z) for a normal law, gammaincc for a gamma law",
-    "ppf": "scipy.special.ndtri(p) for a normal law",
+    "cdf": "scipy.special.ndtr(z) for a normal distribution, gammainc and betainc for a gamma and "
+    "a beta distribution",
+    "logcdf": "scipy.special.log_ndtr(z) for a normal distribution",
+    "sf": "scipy.special.ndtr(-z) for a normal distribution, gammaincc for a gamma distribution",
+    "ppf": "scipy.special.ndtri(p) for a normal distribution",
     **dict.fromkeys(["pdf", "pmf"], "the formula of the density"),
     **dict.fromkeys(["logpdf", "logpmf"], "the formula of the log density"),
     **dict.fromkeys(["quad", "odeint", "solve_ivp"], "a fixed number of steps in a Python loop, "

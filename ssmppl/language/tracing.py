@@ -83,7 +83,7 @@ class _Tracer:
             if not model.functions[role]:
                 raise ModelError(
                     f"model {model.name!r} has no @{role} function",
-                    fix=f"declare the law of {needed} with @model.{role}",
+                    fix=f"declare the distribution of {needed} with @model.{role}",
                     where=model.location,
                 )
         for name in model.inputs:
@@ -144,7 +144,7 @@ class _Tracer:
                     raise ModelError(
                         f"{name!r} is given by two @{function_role} functions; the other is at "
                         f"{sites[name].where}",
-                        fix="give each quantity one law; in a notebook, run the cell of "
+                        fix="give each quantity one distribution; in a notebook, run the cell of "
                         "ssm.Model(...) again before its functions",
                         where=where,
                     )
@@ -184,7 +184,7 @@ class _Tracer:
             if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
                 raise ModelError(
                     f"@{role} {function.__name__} takes *{name}: arguments are bound by name",
-                    fix="name each parameter, state and input that the law depends on",
+                    fix="name each parameter, state and input that the distribution depends on",
                     where=where,
                 )
             value = self._argument(name, role)
@@ -287,7 +287,7 @@ class _Tracer:
             reason = {
                 "prior": f"a prior depends on parameters declared earlier only, and {name!r} is "
                 f"{a(kind)}",
-                "initial": f"the initial law cannot depend on {a(kind)}",
+                "initial": f"the initial distribution cannot depend on {a(kind)}",
                 "observation": f"an observation cannot depend on {a(kind)} of the same time",
             }.get(role, f"{name!r} is {a(kind)}")
         elif name == "t":

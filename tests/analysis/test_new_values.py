@@ -141,7 +141,9 @@ def test_the_order_of_laws():
 
 
 def test_what_follows_from_a_new_value_keeps_that_from_moving_by_itself():
-    with pytest.raises(ArgumentError, match="law of 'lag' is Dirac and follows from states of the"):
+    with pytest.raises(
+        ArgumentError, match="distribution of 'lag' is Dirac and follows from states of the"
+    ):
         ssm.log_likelihood(models.correlated, DATA["correlated"], THETA, proposal="tempered")
 
 
@@ -415,8 +417,8 @@ def test_draws_of_a_step_are_nan_at_the_first_row_of_results():
 def test_explain_tells_a_draw_of_the_step_from_a_state():
     text = str(ssm.explain(models.counts))
     before, _, after = text.partition("Transition, x_prev to x")
-    assert "leave" not in before[before.index("Initial law") :]
-    assert "a draw of the step, without a value at the first row" in after
+    assert "leave" not in before[before.index("Initial distribution") :]
+    assert "auxiliary variable of the transition, undefined at t = 1" in after
 
 
 def test_a_proposal_of_the_users_own():

@@ -92,8 +92,8 @@ def log_normal(x, a):
 TRANSITIONS = {
     sine: "sin", product: "", saturated: "", branch_on_state: "",
     spread_by_state: "spread of the transition of x depends on the state",
-    heavy: "law of x is StudentT", truncated: "law of x is Truncated",
-    log_normal: "law of x is LogNormal",
+    heavy: "distribution of x is StudentT", truncated: "distribution of x is Truncated",
+    log_normal: "distribution of x is LogNormal",
 }  # fmt: skip
 
 
@@ -152,7 +152,7 @@ def gamma_start():
 
 def test_initial_laws_that_miss():
     found = linear_gaussian(model_of(mean=lambda x, a: a * x, initial=gamma_start))
-    assert "initial law of x is Gamma" in found.reason
+    assert "initial distribution of x is Gamma" in found.reason
     assert found.where.line == line_of(gamma_start)
 
 

@@ -51,7 +51,7 @@ def test_an_index_of_the_data_beyond_the_elements():
     text = str(caught.value)
     assert "'u', row 3" in text
     assert "the index u is 3, and there are 3 elements, 0 to 2, in the mean of Normal" in text
-    assert "the law of 'y'" in text
+    assert "the distribution of 'y'" in text
     assert "test_defined.py" in text
     assert "index - 1" in text
 
@@ -90,11 +90,11 @@ def test_an_index_by_the_row_number():
 
 def test_laws_of_states_are_looked_at_in_the_rows_that_they_read():
     moved = model_of(move=lambda x, u: x + np.choose(u, [0.5, 1.0]))
-    with pytest.raises(DataError, match=r"(?s)'u', row 5.*the law of 'x'"):
+    with pytest.raises(DataError, match=r"(?s)'u', row 5.*the distribution of 'x'"):
         evidence(moved, [0, 0, 0, 0, 2, 0])
     evidence(moved, [0, 0, 0, 0, 0, 2])  # nothing follows the last row
     begun = model_of(start=lambda u: np.choose(u, [0.5, 1.0]))
-    with pytest.raises(DataError, match=r"(?s)'u', row 1.*the law of 'x'"):
+    with pytest.raises(DataError, match=r"(?s)'u', row 1.*the distribution of 'x'"):
         evidence(begun, [2, 0, 0, 0, 0, 0])
     evidence(begun, [0, 2, 2, 2, 2, 2])
 
@@ -125,7 +125,9 @@ def test_laws_inside_of_laws():
         inner = [ssm.Normal(x + np.choose(u, [0.0, 1.0]), sd=1.0), ssm.Normal(x, sd=9.0)]
         return ssm.Mixture([0.9, 0.1], inner)
 
-    with pytest.raises(DataError, match=r"(?s)'u', row 4.*the mean of Normal, the law of 'y'"):
+    with pytest.raises(
+        DataError, match=r"(?s)'u', row 4.*the mean of Normal, the distribution of 'y'"
+    ):
         ssm.log_likelihood(observed_by(law), {"y": Y, "u": [0, 1, 1, 2, 0, 0]}, {})
 
 

@@ -107,7 +107,7 @@ def test_an_interrupt_says_that_the_report_is_not_whole(calls, monkeypatch, tmp_
     monkeypatch.setattr(ssm, "diagnose", lambda *a, **k: light(interrupted=True), raising=False)
     done = run("walk.py", "series.csv", code=130)
     assert "the stages done so far tell. series_report/stages holds them" in done.stderr
-    assert "goes on from the stages done" in (tmp_path / "series_report/report.txt").read_text(
+    assert "resumes from the completed stages" in (tmp_path / "series_report/report.txt").read_text(
         encoding="utf-8"
     )
 

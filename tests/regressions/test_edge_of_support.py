@@ -46,7 +46,7 @@ def test_a_variance_at_zero_leaves_the_others_their_errors(slope: str, edge: flo
         smaller.covariance.loc[names, names].to_numpy(), rel=1e-4
     )
     (note,) = found.notes
-    assert note.startswith(f"the maximum in s is at {edge:g}, the edge of what it can be")
+    assert note.startswith(f"the maximum in s is at {edge:g}, the boundary of its parameter space")
 
 
 def test_em_on_its_way_to_the_edge_has_the_errors_too():
@@ -233,7 +233,7 @@ def test_a_ramp_is_followed_exactly():
     data = {"y": np.arange(20.0)}
     found = ssm.maximize(model, data, seed=1, progress=False)
     assert not found.attrs["converged"]
-    assert "the data of y can be followed exactly by the model" in found.notes[0]
+    assert "the data of y are fitted exactly" in found.notes[0]
 
 
 def test_sampling_constant_data():

@@ -126,5 +126,5 @@ def test_what_one_law_keeps_is_not_read_by_another():
 
     model = walk(transition=transition, observation=observation)
     trace(model)  # the transition comes after
-    with pytest.raises(ssm.ModelError, match="'y' reads x_prev, a symbol of another law"):
+    with pytest.raises(ssm.ModelError, match="'y' reads x_prev, a symbol of another distribution"):
         trace(model)

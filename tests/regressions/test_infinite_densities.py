@@ -327,7 +327,12 @@ def test_a_filter_names_the_law_without_a_density():
         pair_failure(problem, theta, NAN, 0, e),
     ):
         assert re.search(NO_COVARIANCE, str(error))
-        for fragment in ("s = [1.e-200", "in the law of y", "ssm.InverseWishart", __file__):
+        for fragment in (
+            "s = [1.e-200",
+            "in the distribution of y",
+            "ssm.InverseWishart",
+            __file__,
+        ):
             assert fragment in str(error)
 
 

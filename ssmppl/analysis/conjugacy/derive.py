@@ -80,7 +80,7 @@ def conjugate_update(search: Search, found: Found) -> Update:
     where, reason = site.distribution.location, ""
     if found.outside_family:
         sources = [f for j in found.outside_family for f in form.origins[form.monomials[j]]]
-        laws = sorted({f"{f.role} law of {f.site}" for f in sources})
+        laws = sorted({f"{f.role} distribution of {f.site}" for f in sources})
         left = ", ".join(to_text(form.functions[j]) for j in found.outside_family)
         where = sources[0].where
         reason = (
@@ -144,11 +144,12 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
         notes.append(improper)
     if update.inseparable_terms:
         laws = " and the ".join(
-            dict.fromkeys(f"{f.role} law of {f.site}" for f in update.inseparable_terms)
+            dict.fromkeys(f"{f.role} distribution of {f.site}" for f in update.inseparable_terms)
         )
         notes.append(
-            f"Metropolis-Hastings with the {update.family_name} law, which leaves out the {laws}, "
-            f"as independence proposal, followed by univariate slice sampling: {update.reason}"
+            f"Metropolis-Hastings with the {update.family_name} distribution, which omits the "
+            f"{laws}, as independence proposal, followed by univariate slice sampling: "
+            f"{update.reason}"
         )
         if update.where is not None:
             notes.append(update.where.short)
@@ -156,14 +157,14 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
         text = describe.correction_text(form, update.outside_family)
         if _may_be_bounded(update):
             notes.append(
-                f"rejection sampling from the {update.family_name} law with acceptance probability "
-                f"proportional to {text}: {update.reason}"
+                f"rejection sampling from the {update.family_name} distribution with acceptance "
+                f"probability proportional to {text}: {update.reason}"
             )
         else:
             notes.append(
-                f"Metropolis-Hastings with the {update.family_name} law as independence proposal "
-                f"(density ratio {text} not known to be bounded), followed by univariate slice "
-                f"sampling: {update.reason}"
+                f"Metropolis-Hastings with the {update.family_name} distribution as independence "
+                f"proposal (density ratio {text} not known to be bounded), followed by univariate "
+                f"slice sampling: {update.reason}"
             )
         if update.where is not None:
             notes.append(update.where.short)

@@ -74,12 +74,14 @@ def joined(components: Sequence[Expr]) -> str:
 
 
 def statistics(form: BlockForm) -> tuple[str, ...]:
-    """One line for each function of the block: how its statistic is summed."""
+    """A heading, and a line for each function of the block: how its statistic is summed."""
     words = Wording(form, "")
     lines = [
         f"{shorten(to_text(function))}: {words.linear(i)}"
         for i, function in enumerate(form.functions[:MAX_STATISTICS])
     ]
+    if lines:
+        lines.insert(0, "sufficient statistics C[.]:")
     hidden = len(form.functions) - MAX_STATISTICS
     return tuple(lines) + ((f"... and {hidden} more",) if hidden > 0 else ())
 

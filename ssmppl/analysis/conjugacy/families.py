@@ -146,12 +146,12 @@ class Gamma(Family):
     def law(self, words: Wording) -> str:
         shape = words.linear(self.log, 1.0 / self.power, 1.0 / self.power)
         rate = words.statistic(self.pow)
-        return f"{_variate(words.names[0], self.power)}, shape = {shape}, rate = -{rate}"
+        return f"{_variate(words.names[0], self.power)}(shape = {shape}, rate = -{rate})"
 
     def when_improper(self, known: Callable[[int], float | None]) -> str:
         c = known(self.log)
         proper = c is None or (c + 1.0) / self.power > 0.0
-        improper = "the Gamma law is improper (shape or rate not positive)"
+        improper = "the Gamma distribution is improper (shape or rate not positive)"
         return "" if proper else f"slice sampling when {improper}"
 
 
@@ -295,7 +295,7 @@ class Normal(Family):
         return f"{words.name} ~ Normal(H^-1 h, precision = H), {len(words.names)} numbers"
 
     def when_improper(self, known: Callable[[int], float | None]) -> str:
-        return "slice sampling when the Normal law is improper (H not positive definite)"
+        return "slice sampling when the Normal distribution is improper (H not positive definite)"
 
     @property
     def as_matrices(self) -> bool:
@@ -439,17 +439,20 @@ class NormalGamma(ScaledFamily):
             )
             square = f" - {h}**2 / (2*H)" if normal.linear[0] >= 0 else ""
             return (
-                f"{_variate(v, self.power)}, shape = {shape}, rate = -{rate}{square}; {thetas[0]} "
+                f"{_variate(v, self.power)}(shape = {shape}, rate = -{rate}{square}); {thetas[0]} "
                 f"| {v} ~ Normal({h} / H, precision = {scale}*H), H = {precision}"
             )
         return (
-            f"{_variate(v, self.power)}, shape = {shape}, rate = -{rate} - h' H^-1 h / 2; "
+            f"{_variate(v, self.power)}(shape = {shape}, rate = -{rate} - h' H^-1 h / 2); "
             f"({', '.join(thetas)}) | {v} ~ Normal(H^-1 h, precision = {scale}*H), h and H from "
             "the linear and quadratic statistics"
         )
 
     def when_improper(self, known: Callable[[int], float | None]) -> str:
-        return "one-at-a-time updates when the joint law is improper (H or the rate not positive)"
+        return (
+            "one-at-a-time updates when the joint distribution is improper (H or the rate not "
+            "positive)"
+        )
 
 
 @dataclass(frozen=True)

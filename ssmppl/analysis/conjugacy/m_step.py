@@ -245,8 +245,8 @@ def _group(search: Search, components: tuple[Expr, ...], form: BlockForm) -> Gro
 def _left(found: Found, j: int) -> NotApplicable:
     source = found.form.origins[found.form.monomials[j]][-1]
     return NotApplicable(
-        f"the {source.role} law of {source.site} leaves {found.form.functions[j]!r} outside the "
-        f"{found.family.name} family",
+        f"the {source.role} distribution of {source.site} leaves {found.form.functions[j]!r} "
+        f"outside the {found.family.name} family",
         source.where,
     )
 

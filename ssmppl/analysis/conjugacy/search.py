@@ -130,7 +130,9 @@ class Search:
         positions = growing or others or list(range(len(form.functions)))
         if not positions:
             where = self.site(form.components[0]).distribution.location
-            reason = f"no density depends on {names}: a constant prior, and no law names it"
+            reason = (
+                f"no density depends on {names}: a constant prior, and no distribution names it"
+            )
             return NotApplicable(reason, where)
         term = form.origins[form.monomials[positions[0]]][-1]
         text = ", ".join(shorten(to_text(form.functions[i])) for i in positions[:4])

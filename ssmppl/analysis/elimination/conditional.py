@@ -48,7 +48,7 @@ def conditionally_linear(trace: Trace) -> ConditionallyLinear | NotApplicable:
     linear -= _cover(_products(trace, linear), trace)
     linear = _noisy(trace, linear)
     if not linear:
-        reason = next(iter(out.values()), NotApplicable("no state has a Gaussian law"))
+        reason = next(iter(out.values()), NotApplicable("no state has a Gaussian distribution"))
         return NotApplicable(
             f"no state is linear and Gaussian given the others: {reason.reason}", reason.where
         )

@@ -101,7 +101,9 @@ def _exact(
     if update.inseparable_terms or update.outside_family:
         return NotApplicable(update.reason, update.where)
     if not family.written_out:
-        return NotApplicable(f"a law of matrices, {family.name}, is not written out in scalars")
+        return NotApplicable(
+            f"a distribution of matrices, {family.name}, is not written out in scalars"
+        )
     if family.normals > LARGEST:
         return NotApplicable(f"{family.normals} numbers jointly Normal, more than {LARGEST}")
     if update.kind == "real":
@@ -109,7 +111,7 @@ def _exact(
             constant_ = low.op == high.op == "const"
             if not constant_ or low.data > natural[0] or high.data < natural[1]:
                 return NotApplicable(
-                    f"the prior truncates {name}, and the {family.name} law with it",
+                    f"the prior truncates {name}, and the {family.name} distribution with it",
                     search.site(found.components[0]).distribution.location,
                 )
     return verify(data, update) or update
@@ -126,7 +128,7 @@ def _apart(data: CompleteData, taken: Sequence[Update], update: Update) -> Updat
             if held & set(other.components) and held & set(update.components):
                 term = form.origins[monomial][0]
                 return NotApplicable(
-                    f"the {term.role} law of {term.site} holds it together with "
+                    f"the {term.role} distribution of {term.site} holds it together with "
                     f"{joined(other.components)}, which is eliminated, and both have no common "
                     "family",
                     term.where,

@@ -77,7 +77,8 @@ def noises(trace: Trace, missing: Missing) -> Noises | NotApplicable:
         site = next(iter(trace.transition.values()))
         kinds = sorted({type(s.distribution).__name__ for s in trace.transition.values()})
         return NotApplicable(
-            f"no state has a law of location and scale ({', '.join(kinds)}): no noise to hold",
+            f"no state has a location-scale distribution ({', '.join(kinds)}): no "
+            "non-centred parametrisation",
             site.distribution.location,
         )
     held = initial.parameters | transition.parameters
@@ -90,7 +91,9 @@ def noises(trace: Trace, missing: Missing) -> Noises | NotApplicable:
     lookahead = lookahead_model(trace, missing)
     if not (tied if isinstance(lookahead, LookaheadModel) else held):
         site = next(iter(trace.transition.values()))
-        return NotApplicable("no parameter is in the law of a state", site.distribution.location)
+        return NotApplicable(
+            "no parameter is in the distribution of a state", site.distribution.location
+        )
     first, second = ([p for p in trace.parameters if p in names] for names in (held, tied))
     return Noises(initial, transition, tuple(first), tuple(second), lookahead)
 

@@ -109,8 +109,11 @@ def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable
     elif guided.look_ahead is None:
         new = set(trace.state_symbols)
         reading = any(reads_of(site) & new for site in trace.transition.values())
-        which = "that is drawn by its own law, as others read its new value or it is not Gaussian,"
-        plain = "with neither a Gaussian nor a deterministic law"
+        which = (
+            "that is drawn by its own distribution, as others read its new value or it is not "
+            "Gaussian,"
+        )
+        plain = "with neither a Gaussian nor a deterministic distribution"
         found["auxiliary"] = NotApplicable(
             f"a state {which if reading else plain} stands between x_{{t-1}} and y_t"
         )
@@ -118,8 +121,9 @@ def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable
         found["auxiliary"] = replace(
             guided,
             name="auxiliary",
-            explanation=guided.explanation + ", and resampled by how well their successors are "
-            "expected to fit y_t",
+            explanation=guided.explanation
+            + ", and resampled with first-stage weights approximating "
+            "p(y_t | x_{t-1})",
         )
         found["guided"] = replace(guided, look_ahead=None)
     return found
@@ -130,7 +134,9 @@ def without_start(trace: Trace) -> NotApplicable | None:
     flat = flat_start(trace)
     if not flat:
         return None
-    reason = f"the initial law of {flat[0].name!r} is Flat: no particle can be drawn from it"
+    reason = (
+        f"the initial distribution of {flat[0].name!r} is Flat: no particle can be drawn from it"
+    )
     return NotApplicable(reason, flat[0].distribution.location)
 
 
@@ -146,7 +152,7 @@ def bootstrap(trace: Trace, missing: Missing) -> Proposal:
         observed,
         resolved(draws_of(trace, list(trace.transition.values()))),
         observed,
-        explanation="particles move by the transition and are weighed by the observation",
+        explanation="particles move by the transition and are weighted by the observation density",
     )
 
 

@@ -38,7 +38,7 @@ def tempered(trace: Trace, missing: Missing) -> Tempered | NotApplicable:
     flat = flat_start(trace)
     if flat:
         where = flat[0].distribution.location
-        return NotApplicable(f"the initial law of {flat[0].name!r} is Flat", where)
+        return NotApplicable(f"the initial distribution of {flat[0].name!r} is Flat", where)
     singular = singular_covariance(trace)
     if singular is not None:
         return singular
@@ -51,8 +51,8 @@ def tempered(trace: Trace, missing: Missing) -> Tempered | NotApplicable:
         for site in known:
             if any(depends_on(e, list(own)) for e in array(site.distribution.mean()).ravel()):
                 return NotApplicable(
-                    f"the {role} law of {site.name!r} is Dirac and follows from states of the same "
-                    "step, which cannot be moved by themselves",
+                    f"the {role} distribution of {site.name!r} is Dirac and follows from states of "
+                    "the same step, which cannot be moved by themselves",
                     site.distribution.location,
                 )
         moving.append(own)

@@ -126,10 +126,14 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
             value.update(component_means([site]))
             continue
         if not d.gaussian_noise:
-            reason = f"the law of {site.name} is {type(d).__name__}, not one of a Gaussian noise"
+            kind = type(d).__name__
+            reason = f"the distribution of {site.name} is {kind}, not driven by Gaussian noise"
             return NotApplicable(reason, d.location)
         if isinstance(d, MvNormal) and d.root is not None:
-            reason = f"the covariance of {site.name} is singular, so that its noises do not show"
+            reason = (
+                f"the covariance of {site.name} is singular, so that the noise cannot be recovered "
+                "from the state"
+            )
             return NotApplicable(reason, d.location)
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         noise += new

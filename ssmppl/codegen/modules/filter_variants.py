@@ -92,7 +92,8 @@ def scored_filter(
             if any(depends_on(e, wanted) for e in array(site.distribution.mean()).ravel()):
                 where = site.distribution.location
                 return NotApplicable(
-                    f"the {role} law of {site.name} is Dirac and depends on a parameter", where
+                    f"the {role} distribution of {site.name} is Dirac and depends on a parameter",
+                    where,
                 )
     layout = Layout(trace)
     section = filter_functions(layout, proposal)
@@ -110,7 +111,9 @@ def scored_filter(
             curvatures = _lower(hessian(total, wanted)) if second else []
         except NotDifferentiable as error:
             where = next(iter(sites.values())).distribution.location
-            return NotApplicable(f"a law has no derivative in closed form: {error.found}", where)
+            return NotApplicable(
+                f"a distribution has no derivative in closed form: {error.found}", where
+            )
         what = "log { mu(x_1) g(y_1 | x_1) }" if name else "log { f(x_t | x_{t-1}) g(y_t | x_t) }"
         _outputs(section, f"gradient{name}", f"Gradient of {what}.", arguments, slopes)
         if second:

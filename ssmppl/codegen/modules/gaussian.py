@@ -498,10 +498,11 @@ def observed_moments(sites: list[Site]) -> list[Expr] | NotApplicable:
             covariance[range(at, at + n), range(at, at + n)] = array(law.variance()).ravel()
         own = [*means[at : at + n], *covariance[at : at + n, at : at + n].ravel()]
         if law.joint and not isinstance(law, MvNormal):
-            reason = f"the covariance of {type(law).__name__}, the law of {site.name}, is not known"
+            kind = type(law).__name__
+            reason = f"the covariance of {kind}, the distribution of {site.name}, is not known"
             return NotApplicable(reason, law.location)
         if any(e.op == "const" and not np.isfinite(e.data) for e in own):
-            reason = f"the law of {site.name} has no mean, or no variance"
+            reason = f"the distribution of {site.name} has no mean, or no variance"
             return NotApplicable(reason, law.location)
         at += n
     return means + [covariance[i, j] for i in range(len(means)) for j in range(i + 1)]

@@ -28,7 +28,7 @@ def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     if steered:
         assert not isinstance(found.lookahead, NotApplicable)
         linear_passes(section, trace, found.lookahead)
-    what = "of a Gaussian approximation to their posterior" if steered else "of their laws"
+    what = "of a Gaussian approximation to their posterior" if steered else "of their distributions"
     out.add(f"the states by the noises {what}", section)
     if steered:
         # what a row of data is worth, as its log factorials, the maps above have no use for

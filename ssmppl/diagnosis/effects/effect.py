@@ -310,7 +310,7 @@ def effect(
     def declare(function: Callable[..., Any]) -> Effect:
         if not inspect.isfunction(function):
             raise ModelError(
-                f"@effect stands on {function!r}, which is no function",
+                f"@effect decorates {function!r}, which is not a function",
                 fix='write @ssm.effect(on="rate") on the line above a def',
             )
         doc = " ".join((function.__doc__ or "").split())

@@ -32,7 +32,7 @@ REPLICATES = 2000  # of the bootstrap
 LEAST_CHOSEN = 10  # blocks that the choice of their length leaves
 FEWEST_BLOCKS = 5  # below which the bootstrap does not know a variance
 SAME = 1e-3  # relative difference of two gains up to which they are the same model's
-NOT_GIVEN = "the share of the reference model's gain is not given: {}"
+NOT_GIVEN = "the share of the reference model's gain could not be computed: {}"
 
 Kind = Literal["bounded", "complement", "unbounded"]
 
@@ -175,8 +175,8 @@ def gain_ratio(
     if not low > 0.0:
         nan = float("nan")
         reason = (
-            f"no measurable gap: the reference gains {total[1]:.1f} nats, {level:.0%} interval "
-            f"from {low:.1f}"
+            f"no measurable gap: held-out gain of the reference model {total[1]:.1f} nats, "
+            f"{level:.0%} interval from {low:.1f}"
         )
         return GainRatio(nan, nan, nan, gain[0], gain[1], covariance, length, blocks, level,
                       reason)  # fmt: skip

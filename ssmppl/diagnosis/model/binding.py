@@ -90,7 +90,7 @@ def _laws(
         ):
             raise _refuse(
                 effect,
-                f"its {which} laws are {dict(laws)!r}",
+                f"its {which} distributions are {dict(laws)!r}",
                 f"give a distribution for each of: {', '.join(effect.states)}",
             )
         out.append({names.get(n, n): d for n, d in laws.items()})
@@ -101,7 +101,7 @@ def _laws(
             if states:
                 raise _refuse(
                     effect,
-                    f"the initial law of {name!r} depends on {states[0]!r}",
+                    f"the initial distribution of {name!r} depends on {states[0]!r}",
                     "let it depend on parameters, inputs and shape parameters only",
                 )
     return out[0], out[1]
@@ -271,5 +271,5 @@ def check_base(candidate: Candidate, equations: Equations, bound: Bound, role: s
             raise _refuse(
                 candidate.effect,
                 f"at strength 0 it gives {left!r} in place of {base!r}",
-                "write it so that strength 0 gives the model back",
+                "write it so that strength 0 reproduces the original model",
             )

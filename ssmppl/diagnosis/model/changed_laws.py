@@ -70,7 +70,7 @@ def scale_of_mean(d: Distribution) -> str | NotApplicable:
     if inner.mean_link is not None:
         return inner.mean_link.scale
     kind = type(inner).__name__
-    return NotApplicable(f"its law is {kind}, whose mean cannot be moved by an increment",
+    return NotApplicable(f"its distribution is {kind}, whose mean cannot be moved by an increment",
                          d.location)  # fmt: skip
 
 
@@ -114,11 +114,11 @@ def has_scale(d: Distribution) -> NotApplicable | None:
     if inner.variance_link is not None:
         return None
     kind = type(inner).__name__
-    reason = f"its law is {kind}, whose variance follows from its mean"
+    reason = f"its distribution is {kind}, whose variance follows from its mean"
     if isinstance(inner, Dirac):
         reason = "it has no noise (Dirac)"
     elif isinstance(inner, (Mixture, UserDefined)):
-        reason = f"its law is {kind}, of which no argument is known to be its spread"
+        reason = f"its distribution is {kind}, of which no argument is known to be its spread"
     return NotApplicable(reason, d.location)
 
 
@@ -147,7 +147,9 @@ def has_tail(d: Distribution) -> NotApplicable | None:
     if isinstance(inner, Normal):
         return None
     kind = type(inner).__name__
-    return NotApplicable(f"its law is {kind}: heavier tails are for Normal ones", d.location)
+    return NotApplicable(
+        f"its distribution is {kind}: heavier tails are for Normal ones", d.location
+    )
 
 
 def heavier(d: Distribution, changes: Changes) -> Distribution:

@@ -25,7 +25,7 @@ from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP
 from ssmppl.errors import SSMError
 from ssmppl.language.model.model import Model
 
-TOLD = 12  # causes of which it is told which attribute of an engine's file would carry them
+MAX_ATTRIBUTES = 12  # causes whose attribute in an engine's file is looked up
 
 
 def build_report(r: Results, seconds: float) -> GapReport:
@@ -131,7 +131,7 @@ def _attributes(
     strengths = dict(enumerate(causes["estimate"]))
     strengths |= {d["row"]: d["estimate"] for d in leading if "estimate" in d}
     out = {}
-    for i, k in enumerate(order[: min(len(causes), TOLD)]):
+    for i, k in enumerate(order[: min(len(causes), MAX_ATTRIBUTES)]):
         named = i in {d["row"] for d in leading} or float(causes["p"].iloc[i]) <= r.alpha
         if not named:
             continue

@@ -35,6 +35,7 @@ HEADINGS = {
     "gain_noise": "nats, rest of the distribution", "rmse_before": "error before",
     "rmse_after": "error after", "p": "p",
 }  # fmt: skip
+MODELS = {"before": "original model", "after": "augmented model"}
 TABLES = {
     "causes": "All effects tried, best first",
     "classes": "Effects not distinguishable by these data",
@@ -52,7 +53,8 @@ CAPTIONS = {
     "the original model, 100% the reference. Lines are 95% intervals; an arrow where they are "
     "unbounded or leave the axis.",
     "missing_term": "The term missing from the equation in each step, estimated by smooth "
-    "functions, with its pointwise 95% band. Where the band contains zero, nothing may be missing.",
+    "functions, with its pointwise 95% band. Where the band contains zero, the term is not "
+    "significant.",
     "free_run": "Open-loop simulation: each model is started once and does not see the data again. "
     "Shaded: 95% prediction interval.",
 }
@@ -157,10 +159,10 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
         f"<p>{_text(words.headline(report))}</p>", "</section>",
         _answers(report),
         _section("How sure", _list(words.how_sure(report)) + _unknown(report)),
-        _section("What to do next", _list(words.next_steps(report))),
+        _section("Next steps", _list(words.next_steps(report))),
         evidence,
         tables,
-        _section("Words used here", _glossary()),
+        _section("Glossary", _glossary()),
         _model(report),
         f"<footer><p>{_text(_colophon(report))}</p></footer>",
         "</main>", "</body>", "</html>",
@@ -197,9 +199,9 @@ def _answers(report: Findings) -> str:
     """Three cards: a large word or number, and the sentences below it."""
     found = words.leaders(report)
     gap = words.rows(report.where)[:1] if report.verdict != NO_GAP else []
-    spot = words.place(gap[0]) if gap else "nowhere in particular"
+    spot = words.place(gap[0]) if gap else "no localised misfit"
     names = [words.listed(words.alternatives(report, row), "or") for row in found]
-    cause = {NONE_OF_THESE: "none of these", NO_GAP: "nothing found"}
+    cause = {NONE_OF_THESE: "none of these", NO_GAP: "no significant effect"}
     first = (words.rows(report.closed) or [{"F": None}])[0]
     far, ends = "not measured", ""
     if is_number(first["F"]):
@@ -229,9 +231,9 @@ def _unknown(report: Findings) -> str:
     """What could not be decided, and what has to be known before the figures are used."""
     out = ""
     for title, items in (
-        ("Not identified by these data", words.undecided(report)),
+        ("Not identifiable", words.undecided(report)),
         ("Notes", [words.sentence(n) for n in report.notes]),
-        ("Failed parts", words.left_out(report)),
+        ("Failed computations", words.left_out(report)),
     ):
         if items:
             out += f"\n<h3>{title}</h3>\n{_list(items)}"
@@ -307,7 +309,7 @@ def _tables(report: Findings) -> str:
         out.append(_table(title + count, heads, body, _left(table)))
     estimates = _estimates(report)
     if estimates:
-        heads = ["parameter", *(f"{when} it was added" if len(report.estimates) > 1 else "estimate"
+        heads = ["parameter", *(MODELS.get(when, when) if len(report.estimates) > 1 else "estimate"
                                 for when in report.estimates)]  # fmt: skip
         out.append(_table("Parameters, with standard errors", heads, estimates, {0}))
     used = [[k, v if isinstance(v, str) else repr(v)] for k, v in report.settings.items()]
@@ -379,7 +381,7 @@ def _model(report: Findings) -> str:
     link = f'<p><a download="augmented_model.py" href="data:text/x-python;base64,{coded}">' \
            "Download augmented_model.py</a></p>"  # fmt: skip
     return _section(
-        "The augmented model",
+        "Augmented model",
         f'{link}\n<div class="scroll" tabindex="0" role="region" aria-label="Model file">'
         f"<pre><code>{html.escape(report.model_text)}</code></pre></div>",
     )

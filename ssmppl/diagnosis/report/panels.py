@@ -226,7 +226,7 @@ def missing_term(report: Findings, ax: Any, equation: Any = None, variable: Any 
     ax.plot(x[order], mid, color=AFTER, linewidth=1.6)
     ax.margins(x=0)
     ax.set_xlabel(str(variable))
-    ax.set_ylabel(f"missing in {equation}")
+    ax.set_ylabel(f"estimated missing term in {equation}")
     bare(ax)
     return ax
 

@@ -161,7 +161,7 @@ class Lines:
             return f"{self._primitive(node)}({', '.join(text for text, _ in parts)})", Level.ATOM
         raise ArgumentError(
             f"the model holds {node!r}, whose operation {node.op!r} has no spelling in Python",
-            fix="use what NumPy and scipy.special offer in the model's laws",
+            fix="use what NumPy and scipy.special offer in the model's distributions",
         )
 
     def _loop(self, node: Expr) -> Text:

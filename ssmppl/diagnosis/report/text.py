@@ -1,4 +1,4 @@
-"""`print(report)`: the verdict, the three answers, one table, and what could not be decided."""
+"""`print(report)`: the verdict, the four answers, one table, and what could not be decided."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def _table(cells: list[tuple[str, ...]]) -> list[str]:
 
 
 def report_text(report: Findings) -> str:
-    """The verdict, the three answers, one table, what is undecided and what would decide it."""
+    """The verdict, the four answers, one table, what is undecided and what would decide it."""
     lines = [*wrapped(words.headline(report)), ""]
-    for name, sentences in words.answers(report):
+    for name, sentences in words.sections(report):
         lines += wrapped(" ".join(sentences), f"{name:<10}", " " * 10)
     cells = cause_rows(report)
     if len(cells) > 1:
@@ -81,7 +81,7 @@ def report_html(report: Findings) -> str:
     parts = [markup.heading(report.title or "Diagnosis"), markup.paragraph(words.headline(report))]
     rows_of_answers = [
         (markup.text(name), markup.text(" ".join(sentences)))
-        for name, sentences in words.answers(report)
+        for name, sentences in words.sections(report)
         if sentences
     ]
     parts.append(markup.table(rows_of_answers, left=(0, 1)))
@@ -104,9 +104,9 @@ def report_html(report: Findings) -> str:
 def _rest(report: Findings) -> list[tuple[str, list[str]]]:
     """What could not be decided, what would decide it, and what has to be known."""
     found = [
-        ("Could not be decided", words.undecided(report)), ("What next", words.next_steps(report)),
+        ("Not identifiable", words.undecided(report)), ("Next steps", words.next_steps(report)),
         ("Notes", [words.sentence(n) for n in report.notes]),
-        ("Left out", words.left_out(report)),
+        ("Failed computations", words.left_out(report)),
     ]  # fmt: skip
     return [(name, items) for name, items in found if items]
 

@@ -153,7 +153,7 @@ def share(report: Findings) -> str:
     if not closed or not is_number(closed[0]["F"]):
         return ""
     first = closed[0]
-    return f"gives {percent(first['F'])} of the reference model's gain in held-out log " \
+    return f"achieves {percent(first['F'])} of the reference model's gain in held-out log " \
            f"predictive density ({interval(first['F_low'], first['F_high'])})"  # fmt: skip
 
 
@@ -165,10 +165,10 @@ def kept_back(report: Findings) -> str:
     part = report.parts.get("confirm")
     when = _when(report, part) if isinstance(part, tuple | list) else str(part or "")
     if when and _experiment(report):
-        when += ", and likewise of the others"
+        when += " and the corresponding rows of the other experiments"
     own = "on held-out data"
     if "choice" in report.parts:
-        own = "on data that took part in the selection only in that an effect was left out again"
+        own = "on held-out data that were also used to drop one effect"
     return own + (f" ({when})" if when else "")
 
 
@@ -182,15 +182,15 @@ def _when(report: Findings, part: Sequence[Any]) -> str:
     return span(first, last, _experiment(report))
 
 
-def outstanding(report: Findings, table: Any) -> list[dict[str, Any]]:
+def significant_rows(report: Findings, table: Any) -> list[dict[str, Any]]:
     """The rows of `where` or `detection` that are more than chance."""
     alpha = report.settings.get("alpha", 0.05)
     return [r for r in rows(table) if is_number(r["p"]) and r["p"] <= alpha]
 
 
 # -- the answers
-def answers(report: Findings) -> list[tuple[str, list[str]]]:
-    """The title and the sentences of each answer."""
+def sections(report: Findings) -> list[tuple[str, list[str]]]:
+    """The title and the sentences of each section: where, which, how far, how sure."""
     return [
         ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
         ("How sure", how_sure(report)),
@@ -203,7 +203,7 @@ def headline(report: Findings) -> str:
         return _no_gap(report)
     if report.verdict == NONE_OF_THESE:
         return _none_of_these(report)
-    found = leaders(report) or [{"effect": "something", "equation": "", "p": None}]
+    found = leaders(report) or [{"effect": "an unidentified effect", "equation": "", "p": None}]
     groups = [alternatives(report, row) for row in found]
     sure = p_text(found[0].get("p"))
     unfitted = bool(found[0].get("unfitted"))
@@ -242,21 +242,24 @@ def _lacks(groups: list[list[str]]) -> tuple[str, str]:
 
 def _none_of_these(report: Findings) -> str:
     measured = share(report)
-    found, failed = outstanding(report, report.where), outstanding(report, report.detection)
+    found, failed = (
+        significant_rows(report, report.where),
+        significant_rows(report, report.detection),
+    )
     spot = ""
     if found:
         when = span(found[0]["t_from"], found[0]["t_to"], found[0]["experiment"])
         spot = f" in {place(found[0])}{f', strongest at {when}' if when else ''}" \
                f" ({p_text(found[0]['p'])})"  # fmt: skip
-    text = f"{named(report)} is misspecified{spot}; none of the {tried(report)} accounts for it."
+    text = f"{named(report)} is misspecified{spot}; none of the {tried(report)} explains it."
     if failed and not found:
         check = f"{failed[0]['statistic']} of {failed[0]['channel']}, {p_text(failed[0]['p'])}"
         text += f" The evidence is a test of the one-step predictions ({check})."
     if measured and _best_tried(report):
-        text += f" The best of them, {_best_tried(report)}, {measured}: curves estimated from " \
-                "the data do clearly better."  # fmt: skip
+        text += f" The best of them, {_best_tried(report)}, {measured}: a semiparametric model " \
+                "(smooth functions) predicts held-out data significantly better."  # fmt: skip
     elif measured:
-        text += f" A curve estimated from the data {measured}."
+        text += f" A semiparametric model (smooth functions) {measured}."
     return sentence(text)
 
 
@@ -292,7 +295,7 @@ def place(row: dict[str, Any]) -> str:
 
 def where(report: Findings) -> list[str]:
     """Which equation, which moment, when and in which region: the three strongest places."""
-    found = outstanding(report, report.where)
+    found = significant_rows(report, report.where)
     if not found:
         return [
             "No equation shows misfit that is significant after correction for multiple testing."
@@ -334,7 +337,7 @@ def which(report: Findings) -> list[str]:
         out.append(sentence(text))
         carried = report.attributes.get(f"{row['effect']} in {row['equation']}")
         if carried:
-            out.append(f"The simulator's file carries it as {carried}.")
+            out.append(f"Corresponding attribute in the simulator's model file: {carried}.")
         others = rivals(report, row)
         if others:
             names = listed([row_label(r) for r in others], "or")
@@ -393,7 +396,7 @@ def how_far(report: Findings) -> list[str]:
         out.append(sentence(text))
     before, after = first["rmse_before"], first["rmse_after"]
     if is_number(before) and is_number(after):
-        way = "falls" if after < before else "does not fall: it goes"
+        way = "decreases" if after < before else "increases"
         out.append(f"Open-loop (free-run) simulation error {way} from {number(before)} to "
                    f"{number(after)} (RMS, units of the data).")  # fmt: skip
     return out
@@ -413,12 +416,14 @@ def how_sure(report: Findings) -> list[str]:
         if used:
             text = listed([f"{USE[name]} {when}" for name, when in used])
             text = sentence(text)
-            text += " Likewise of the other experiments." * bool(_experiment(report))
+            text += " The corresponding rows of the other experiments were used likewise." * bool(
+                _experiment(report)
+            )
             once = len(used) > 1 and "choice" not in report.parts
             out.append(text + " Selection and evaluation rows are disjoint." * once)
     out += [sentence(str(v)) for v in report.parts.values() if isinstance(v, str)]
     tests = [r for r in rows(report.detection) if is_number(r["p"])]
-    bad = outstanding(report, report.detection)
+    bad = significant_rows(report, report.detection)
     if bad:
         names = [f"{r['statistic']} of {r['channel']} ({p_text(r['p'])})" for r in bad[:4]]
         out.append(f"The one-step predictions of the original model failed {len(bad)} of "
@@ -427,8 +432,8 @@ def how_sure(report: Findings) -> list[str]:
         out.append(f"The one-step predictions of the original model passed all {len(tests)} "
                    "tests.")  # fmt: skip
     if report.verdict == NO_GAP:
-        out.append("That does not prove the model right: an effect that is hardly excited cannot "
-                   "be identified from these data.")  # fmt: skip
+        out.append("This does not validate the model: an effect that is not excited cannot be "
+                   "identified from these data.")  # fmt: skip
     return out
 
 
@@ -437,7 +442,7 @@ def undecided(report: Findings) -> list[str]:
     out = []
     for row in leaders(report):
         if rivals(report, row):
-            out.append(sentence(f"which it is: {listed(alternatives(report, row), 'or')}"))
+            out.append(sentence(f"not distinguishable: {listed(alternatives(report, row), 'or')}"))
     parts: dict[tuple[str, str], list[str]] = {}
     for r in rows(report.not_applicable):
         equation = r["equation"] if isinstance(r["equation"], str) else ""
@@ -457,10 +462,13 @@ def next_steps(report: Findings) -> list[str]:
     """What to do now: what to measure, and what to do with the model."""
     out = []
     if report.interrupted:
-        out.append("The run was interrupted: run it again, and it goes on from the stages done.")
+        out.append(
+            "The run was interrupted: run it again, and it resumes from the completed stages."
+        )
     elif len(report.left_out):
-        out.append("Parts of this answer are missing (left out, below). Another run tries them "
-                   "again; with debug=True (--debug) it stops at the first fault.")  # fmt: skip
+        out.append("Parts of this answer are missing (failed computations, below). Another run "
+                   "tries them again; with debug=True (--debug) it raises the first internal "
+                   "error.")  # fmt: skip
     if report.mode == "fast" and report.verdict != NO_GAP:
         out.append("Run it again in full mode: it refits the leading effects and measures the "
                    "held-out gain.")  # fmt: skip
@@ -478,13 +486,16 @@ def next_steps(report: Findings) -> list[str]:
                        f"{listed(alternatives(report, row), 'from')}; add a sensor, or inspect the "
                        "system.")  # fmt: skip
     if report.verdict == NONE_OF_THESE and report.missing is not None:
-        out.append("Look at the estimated curve, think what could have its shape, write it as an "
-                   "@ssm.effect and run again with it.")  # fmt: skip
+        out.append("Look at the estimated curve, consider which physical effect has this shape, "
+                   "write it as an @ssm.effect and run again with it.")  # fmt: skip
     elif report.verdict == NONE_OF_THESE:
-        out.append("Think what could change the noise so, or what acts in that stretch only; write "
-                   "it as an @ssm.effect and run again with it.")  # fmt: skip
+        out.append("Consider which physical effect changes the noise in this way, or acts in that "
+                   "time window only; write it as an @ssm.effect and run again with "
+                   "it.")  # fmt: skip
     elif report.verdict == NO_GAP:
-        out.append("To look closer, record more data, or drive the system over more of its range.")
+        out.append(
+            "To increase power, record more data, or drive the system over more of its range."
+        )
     if report.model_text:
         out.append("The augmented model is ready to use: augmented_model.py, an ordinary model "
                    "file (report.model in Python).")  # fmt: skip

@@ -23,7 +23,7 @@ def reason_of(error: BaseException) -> str:
     if isinstance(error, SSMError):
         return one_line(error.found)
     text = one_line(str(error))
-    return f"{type(error).__name__}{f': {text}' if text else ''} (a fault of ssmppl)"
+    return f"{type(error).__name__}{f': {text}' if text else ''} (internal error in ssmppl)"
 
 
 def one_line(text: str) -> str:

@@ -34,7 +34,8 @@ EIGENVALUE_CUT = 1e-10  # of I_theta,theta in correlation units: below it is rou
 # to order T^-1/2, second-order terms of order 1 stand against S~ of order kappa sqrt(T).
 ABSORBED = 0.03
 LARGEST_SKEWNESS = float(np.sqrt(8.0))  # of a quadratic form in normals: one squared normal's
-CONSTANT, TAKEN = "the same in every set", "absorbed by the parameters"
+CONSTANT = "constant across simulated data sets"
+TAKEN = "not identifiable (collinear with the parameters)"
 DROWNED = "smaller than the smoother's Monte Carlo error"
 SPARE_SETS = 20  # degrees of freedom without which a residual variance says nothing
 

@@ -373,7 +373,7 @@ class Fitter:
         found = climb_together(densities, starts, effort.pilot, information)
         if found is None:
             raise ArgumentError(
-                "the extended Kalman filter comes to no number at every point that was tried",
+                "the extended Kalman filter is not finite (NaN or infinite) at every point tried",
                 fix="give the parameters priors round plausible values, or look whether the "
                 "simulator gives NaN",
             )

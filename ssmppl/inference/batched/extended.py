@@ -40,7 +40,7 @@ class Extended(Scored):
     """A traced model with a simulator, and its extended Kalman filter."""
 
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
-        """log p(y | theta), summed over experiments; -inf where it comes to no number."""
+        """log p(y | theta), summed over experiments; -inf where it is not finite."""
         data, total = tuple(experiments), 0.0
         found = self._approximation(data)
         theta = np.ascontiguousarray(theta, dtype=float)
@@ -57,7 +57,7 @@ class Extended(Scored):
         self, experiment: Experiment, theta: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:
         """(B, T, D) a draw of x_{1:T} given y_{1:T} for each row of theta (B, P), by backward
-        sampling (Rauch, Tung and Striebel's gains); NaN where the filter comes to no number."""
+        sampling (Rauch, Tung and Striebel's gains); NaN where the filter is not finite."""
         rows: list[Moments] = []
         data = (experiment,)
         value = self._filter(data).log_likelihoods(data, theta, rows)
@@ -81,7 +81,7 @@ class Extended(Scored):
 
         Raises
         ------
-        SamplingError : they come to no number.
+        SamplingError : they are not finite.
         """
         return self._kalman(experiment).filter(experiment, theta)
 
@@ -90,7 +90,7 @@ class Extended(Scored):
 
         Raises
         ------
-        SamplingError : they come to no number.
+        SamplingError : they are not finite.
         """
         return self._kalman(experiment).smooth(experiment, theta)
 
@@ -108,7 +108,7 @@ class Extended(Scored):
 
         Raises
         ------
-        SamplingError : they come to no number.
+        SamplingError : they are not finite.
         """
         kalman = self._kalman(experiment)
         found = kalman.filtered(experiment, theta)
@@ -122,7 +122,7 @@ class Extended(Scored):
         """log p(y | theta) and its gradient (P,), by central differences.
 
         free : (P,) bool, the parameters that matter; the gradient is 0 in the others. None: all.
-        Where it comes to no number at theta: -inf, and NaN for the gradient.
+        Where it is not finite at theta: -inf, and NaN for the gradient.
         """
         data, theta = tuple(experiments), np.asarray(theta, dtype=float)
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)

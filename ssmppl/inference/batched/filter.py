@@ -56,7 +56,7 @@ class BatchedFilter:
         record: list[Moments] | None = None,
     ) -> np.ndarray:  # fmt: skip
         """(B,) log p(y | theta) of each row of theta (B, P), summed over the data sets; -inf where
-        it comes to no number, or to none that floating point resolves.
+        it is not finite, or to none that floating point resolves.
 
         record : takes the moments of each row; of a single data set.
         """

@@ -79,10 +79,11 @@ class Student:
         distinct = len(np.unique(points, axis=0))
         if distinct <= d or not np.all(np.ptp(points, axis=0) > 0.0):
             raise SamplingError(
-                "the law that the draws are compared with cannot be fitted: among the first "
-                f"{n} of them, {distinct} differ, in {d} free parameter{'s' if d > 1 else ''}",
+                "the distribution that the draws are compared with cannot be fitted: among the "
+                f"first {n} of them, {distinct} differ, in {d} free "
+                f"parameter{'s' if d > 1 else ''}",
                 fix="give more draws= and warmup=, or more particles; or method=ssm.SMC2(), which "
-                "needs no such law",
+                "needs no such distribution",
             )
         covariance = np.atleast_2d(np.cov(points.T))
         scale = covariance + 1e-10 * np.diag(np.diag(covariance) + 1e-300)

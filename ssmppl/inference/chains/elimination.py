@@ -192,7 +192,7 @@ class Eliminating(GibbsUpdates):
             values = update.family.draw([*own, 0.0], generator)
             if values is None or not np.all(np.isfinite(values)):
                 raise SamplingError(
-                    f"the {update.family_name} law of {', '.join(update.block)} given the "
+                    f"the {update.family_name} distribution of {', '.join(update.block)} given the "
                     "trajectory is improper, and cannot be integrated out",
                     fix="give a proper prior, or use eliminate=False",
                     where=update.where,

@@ -178,7 +178,7 @@ class NoiseMove:
         return log_joints(self.problem, theta, rows)
 
     def _guide(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """A (R, D, D), g (R, D) and their centre (R, D); None where they come to no number."""
+        """A (R, D, D), g (R, D) and their centre (R, D); None where they are not finite."""
         if not self.steered:
             return _NO_GUIDE
         x = self.references
@@ -490,7 +490,7 @@ def prepare_interweaving(
     elif steered:
         moves = [NoiseMove(setup.problem, found, True, near)]
         if not moves[0].stands_near():
-            reason = "the Gaussian approximation to the states' posterior comes to no number"
+            reason = "the Gaussian approximation to the states' posterior is not finite"
             none = NotApplicable(reason)
             found, steered, moves = replace(found, lookahead=none), False, []
             if not found.parameters:
@@ -503,7 +503,7 @@ def prepare_interweaving(
     owner = [t.site.name for t in transforms(setup.problem.trace) for _ in t.free]
     movable = np.array([k for k, i in enumerate(space.positions) if owner[i] in names], dtype=int)
     if not len(movable):
-        return None, "none: no free parameter is in the law of a state"
+        return None, "none: no free parameter is in the distribution of a state"
     looking = 0 if setting is True else min(int(LOOK * adapting), LONGEST_LOOK)
     bounds = parameter_bounds(setup.problem.trace)
     steps = Interweaving(
@@ -525,7 +525,11 @@ def describe_interweaving(found: Noises, model: ExactModel | None) -> str:
     if found.parameters:
         held.append("the noises of the transition")
     text = " or ".join(held) + " held fixed"
-    return text + ", whichever has the larger expected jump" if len(held) > 1 else text
+    return (
+        text + ", whichever has the larger expected squared jump distance"
+        if len(held) > 1
+        else text
+    )
 
 
 def with_states(found: Noises) -> str:
@@ -539,4 +543,4 @@ def with_states(found: Noises) -> str:
     if isinstance(found.lookahead, NotApplicable):
         text += f" (no Gaussian approximation: {found.lookahead.reason})"
     centred = dict.fromkeys((*found.initial.centred, *found.transition.centred))
-    return text + (f"; centred as before: {', '.join(centred)}" if centred else "")
+    return text + (f"; others stay centred: {', '.join(centred)}" if centred else "")

@@ -194,7 +194,7 @@ def _approximation(setup: SamplingSetup, method: ISMCMC) -> GaussianPilot:
     found = gaussian_pilot(setup.space, kind)
     if found is None:
         raise ArgumentError(
-            f"{NAMED[kind]} comes to no number round the start, or its posterior to no mode",
+            f"{NAMED[kind]} is not finite near the start, or its posterior has no mode",
             fix="give start={name: value} near plausible values, or use ssm.PGAS(...)",
         )
     return found
@@ -315,9 +315,9 @@ def _quality(chains: Sequence[Weighted], interrupted: bool) -> dict[str, Any]:
     }  # fmt: skip
     if share < POOR and not interrupted:
         text = (
-            "the approximation is poor: the importance weights of the draws are worth "
-            f"{share:.1%} of equal ones, and the largest carries {largest:.0%} of a chain. The "
-            "posterior that is returned rests on few distinct draws. Use ssm.PGAS(...) or "
+            "the approximation is poor: the importance weights of the draws have relative ESS "
+            f"{share:.1%}; largest normalised weight {largest:.0%}. The posterior that is "
+            "returned rests on few distinct draws. Use ssm.PGAS(...) or "
             "ssm.PMMH(...), or more draws and particles"
         )
         warnings.warn(text, stacklevel=5)

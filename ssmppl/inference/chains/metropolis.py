@@ -61,7 +61,8 @@ def needed_model(problem: Problem, method: str) -> ExactModel:
         )
     if method == "Gibbs" and isinstance(model, Extended):
         raise ArgumentError(
-            "Gibbs draws the states from their exact law, and this model calls a simulator",
+            "Gibbs draws the states from their exact distribution, and this model calls a "
+            "simulator",
             fix="use ssm.MetropolisHastings(), on the extended Kalman filter's likelihood, or "
             'ssm.PMMH(proposal="bootstrap"), or None, which picks the former',
         )

@@ -472,7 +472,7 @@ def _planned(setup: SamplingSetup, method: PMMH) -> _Plan:
         gaussian = setup.once("gaussian", lambda: _gaussian(setup, method))
     if gaussian is None and asked is True:
         kind = approximation_kind(problem)
-        why = kind if isinstance(kind, NotApplicable) else "it comes to no number, or to no mode"
+        why = kind if isinstance(kind, NotApplicable) else "it is not finite, or has no mode"
         raise ArgumentError(
             f"delayed_acceptance=True does not apply: {why}",
             fix="use ssm.PMMH(delayed_acceptance=False)",

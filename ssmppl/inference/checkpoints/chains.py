@@ -225,8 +225,8 @@ class CheckpointFile(Checkpoint):
         if self._cpu != _cpu():
             warnings.warn(
                 f"the checkpoint {self.file} was made on a CPU of type {self._cpu}, and this is "
-                f"{_cpu()}: the chains go on as well, but the last digits of their draws may be "
-                "others than without the interruption",
+                f"{_cpu()}: sampling resumes, but draws may differ in the last digits from those "
+                "of an uninterrupted run",
                 stacklevel=3,
             )
 

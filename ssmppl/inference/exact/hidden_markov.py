@@ -528,8 +528,8 @@ class HiddenMarkov(Scored):
                 i, t = min(zip(h.members[ends >= 0], ends[ends >= 0], strict=True))
                 of = f" of data set {i + 1}" if len(experiments) > 1 else ""
                 where = next(iter(self.trace.observations.values())).distribution.location
-                why, fix = "", ("check this row of the data, and whether the laws leave each value "
-                                "a chance")  # fmt: skip
+                why, fix = "", ("check this row of the data, and whether the distributions leave "
+                                "each value a chance")  # fmt: skip
                 if none := law_without_density_at(self.trace, theta):
                     why, fix, where = none
                 raise SamplingError(

@@ -117,7 +117,7 @@ def start_of(trace: Trace, flat: tuple[int, ...], model: Matrices, experiment: E
             raise SamplingError(
                 f"the start of {trace.state_symbols[i]!r} is Flat, and the data do not tell it "
                 "(together with the components that are Flat before it)",
-                fix="give it a proper law in @initial, or data that depend on it",
+                fix="give it a proper distribution in @initial, or data that depend on it",
                 where=site.distribution.location,
             )
     total = total_of(increments)
@@ -144,7 +144,7 @@ def check_agreement(trace: Trace, start: Start, log_given: float) -> None:
     raise SamplingError(
         f"the start of {site.name!r} is Flat, and its effect grows over time until rounding errors "
         f"hide it: log p(y) is {expected:.8g} or {log_given:.8g}, by where it is computed",
-        fix="give it a proper law in @initial, or its transition some noise",
+        fix="give it a proper distribution in @initial, or its transition some noise",
         where=site.distribution.location,
     )
 
@@ -171,7 +171,7 @@ def slopes(trace: Trace, form: LinearGaussian) -> Slopes:
                 found = differentiate(entries, parameter)
             except NotDifferentiable as error:
                 place = _culprit(trace, LAWS[field], parameter)
-                refused.setdefault(p, (f"the {LAWS[field]} law: {error.found}", place))
+                refused.setdefault(p, (f"the {LAWS[field]} distribution: {error.found}", place))
                 continue
             known += [
                 Slope(p, field, i, e)

@@ -68,7 +68,7 @@ class LaplaceLikelihood:
 
 @dataclass(frozen=True)
 class Approximated:
-    """An approximate log p(y | theta), -inf where it comes to no number; with noise (T, R') of each
+    """An approximate log p(y | theta), -inf where it is not finite; with noise (T, R') of each
     experiment, where it is known: of the likeliest trajectory, or near it. at_mode : which."""
 
     log_likelihood: float
@@ -81,7 +81,7 @@ class ApproximateLikelihood:
     """An approximate log p(y | theta) that is a function of theta alone, as chains need it.
 
     kind : of `APPROXIMATE`. noise : (T, R') of each experiment, from where every search for
-    modes begins; None: from the extended Kalman filter. Where Laplace's comes to no number, the
+    modes begins; None: from the extended Kalman filter. Where Laplace's is not finite, the
     extended filter's stands in for it.
     """
 
@@ -137,7 +137,7 @@ def approximation_of(
 def approximate_log_likelihood(
     problem: Problem, theta: np.ndarray, found: GaussianApproximation, kind: str
 ) -> float:
-    """log p(y | theta) by one of `APPROXIMATE`; -inf where it comes to no number."""
+    """log p(y | theta) by one of `APPROXIMATE`; -inf where it is not finite."""
     if kind == "laplace":
         return LaplaceLikelihood(problem, found)(theta)
     total = 0.0

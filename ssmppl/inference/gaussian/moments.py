@@ -40,7 +40,7 @@ class ApproximateKalman:
         Raises
         ------
         ArgumentError : predictions need moments of the observations, which some law has not.
-        SamplingError : the approximation comes to no number.
+        SamplingError : the approximation is not finite.
         """
         given = theta, e.y, e.seen, e.u
         if self.kind == "unscented":
@@ -73,7 +73,7 @@ class ApproximateKalman:
 
         Raises
         ------
-        SamplingError : the approximation comes to no number.
+        SamplingError : the approximation is not finite.
         """
         if self.kind == "laplace":
             mode = self._mode(e, theta)
@@ -100,7 +100,7 @@ class ApproximateKalman:
 
         Raises
         ------
-        SamplingError : the approximation comes to no number.
+        SamplingError : the approximation is not finite.
         """
         steps, d = e.steps, len(self.problem.trace.state_symbols)
         out = np.empty((draws, steps, d))
@@ -133,7 +133,7 @@ class ApproximateKalman:
 
         Raises
         ------
-        SamplingError : they come to no number.
+        SamplingError : they are not finite.
         """
         if self.kind == "extended":
             return self._extended(e, theta)
@@ -187,7 +187,7 @@ class ApproximateKalman:
         where = next(iter(self.problem.trace.transition.values())).distribution.location
         at = spelled(self.problem.trace, theta)
         return SamplingError(
-            f"{NAMES[self.kind]} comes to no number; parameters: {at}",
+            f"{NAMES[self.kind]} is not finite (NaN or infinite); parameters: {at}",
             fix="look whether the parameters are plausible; ssm.particle_filter does without it",
             where=where,
         )

@@ -69,7 +69,7 @@ def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
     if isinstance(setup.exact, NotApplicable):
         found = laplace_approximation(setup.problem)
         if method.laplace and not isinstance(found, NotApplicable):
-            with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
+            with announced("DirectOptimization", "maximising the likelihood", shown=setup.progress):
                 return GaussianClimb(setup, method, found).run()
         reason = smooth_filter_applies(setup.problem.trace)
         if reason is not None:
@@ -79,7 +79,7 @@ def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
                 fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
                 where=reason.where or setup.exact.where,
             )
-    with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
+    with announced("DirectOptimization", "maximising the likelihood", shown=setup.progress):
         if isinstance(setup.exact, NotApplicable):
             with ThreadPoolExecutor() as pool:  # the filter runs without Python's lock
                 return SmoothClimb(setup, method, pool).run()
@@ -300,14 +300,15 @@ class ExactClimb:
         if not np.isfinite(self.best_value):
             if self.without_slope:
                 raise ArgumentError(
-                    f"the likelihood cannot be climbed: {self.without_slope}", fix=ELSEWHERE
+                    f"the likelihood cannot be maximised (no gradient): {self.without_slope}",
+                    fix=ELSEWHERE,
                 )
             raise ArgumentError(
                 "the likelihood is zero at every point that was tried",
                 fix="give start={name: value} near plausible values",
             )
         if not np.isfinite(gap) and not (interrupted or unbounded):
-            stopped = "the climb ran to the edge of what the parameters can be: no maximum inside"
+            stopped = "the optimiser reached the boundary: no interior maximum"
         point = self.setup.transform.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
@@ -463,7 +464,7 @@ class BatchedClimb:
             return Ascent(theta, None, theta[None], report, interrupted=True)
         if found is None:
             raise ArgumentError(
-                "the extended Kalman filter comes to no number at every point that was tried",
+                "the extended Kalman filter is not finite (NaN or infinite) at every point tried",
                 fix="give start={name: value} near plausible values, or look whether the simulator "
                 "gives NaN",
             )

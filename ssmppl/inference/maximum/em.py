@@ -78,7 +78,9 @@ def maximise_expectation(
     z = setup.space_at(theta)
     value, gradient = expected(theta)
     if with_slope and (reason := transform.without_slope(value, theta, gradient)):
-        raise SamplingError(f"the expected log density cannot be climbed: {reason}", fix=ELSEWHERE)
+        raise SamplingError(
+            f"the expected log density cannot be maximised (no gradient): {reason}", fix=ELSEWHERE
+        )
     before = at(z)[0]
     found = scipy.optimize.minimize(
         at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,
@@ -165,7 +167,7 @@ def climb(setup: Maximization, method: EM) -> Ascent:
         )
     if isinstance(setup.exact, Extended):
         raise ArgumentError(
-            "EM needs the exact law of the states, and this model calls a simulator",
+            "EM needs the exact distribution of the states, and this model calls a simulator",
             fix="use ssm.DirectOptimization(), on the extended Kalman filter's likelihood, or None",
         )
     need_density(setup.problem.trace, "EM", "maximize")

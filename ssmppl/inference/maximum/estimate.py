@@ -124,21 +124,21 @@ class Estimate:
         out = []
         if self.attrs.get("approximate"):
             out.append(f"the likelihood is {self.attrs.get('likelihood', 'an approximation')}")
-        if "approximate_laws" in self.attrs:
-            out.append(str(self.attrs["approximate_laws"]))
+        if "approximate_distributions" in self.attrs:
+            out.append(str(self.attrs["approximate_distributions"]))
         if self.attrs.get("interrupted"):
             out.append("interrupted; this is the best point so far")
         elif self.attrs.get("converged") is False:
             reason = self.attrs.get("stopped", "")
             out.append("not converged" + (f": {reason}" if reason else ""))
         out += [
-            f"{label} is within a standard error of {edge:g}, the edge of what it can be: no "
-            "interval about it follows from that standard error"
+            f"{label} is within a standard error of {edge:g}, the boundary of its parameter space: "
+            "no interval about it follows from that standard error"
             for label, edge in self.attrs.get("at_edge", {}).items()
         ]
         out += [
-            f"the maximum in {label} is at {edge:g}, the edge of what it can be, and has no "
-            "standard error; those of the others hold with it there"
+            f"the maximum in {label} is at {edge:g}, the boundary of its parameter space, and has "
+            "no standard error; those of the others are conditional on it"
             for label, edge in self.attrs.get("held_at_edge", {}).items()
         ]
         how, _, reason = str(self.attrs.get("covariance", "")).partition(": ")

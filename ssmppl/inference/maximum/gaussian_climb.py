@@ -60,7 +60,7 @@ class GaussianClimb:
 
     Raises
     ------
-    ArgumentError : the approximation comes to no number at every point tried for a start.
+    ArgumentError : the approximation is not finite at every point tried for a start.
     """
 
     def __init__(
@@ -205,7 +205,7 @@ class GaussianClimb:
             k += 1
         if best is None:
             raise ArgumentError(
-                "Laplace's approximation comes to no number at every point that was tried",
+                "Laplace's approximation is not finite (NaN or infinite) at every point tried",
                 fix="give start={name: value} near plausible values",
             )
         return best, k
@@ -271,12 +271,12 @@ class _Correction:
             if far:  # the ellipsoid is another one there
                 self.information = self.climb.information(self.z)
                 if not np.all(np.isfinite(self.information)):
-                    return "its second derivatives are no numbers on the way"
+                    return "its second derivatives are not finite on the way"
                 self.axes = axes_of(self.information)
             smooth, lacking, spread, bend = self._slopes(middle)
             slope = smooth + lacking
             if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(bend))):
-                return "the particle filter comes to no number one standard deviation off its top"
+                return "the particle filter is not finite one standard deviation from its maximum"
             curvature = np.maximum(1.0 - bend, LEAST_CURVATURE)
             step = slope / curvature
             step *= self._share(step, lacking, bend)
@@ -319,11 +319,11 @@ class _Correction:
                 break
             self.particles = min(4 * self.particles, self.climb.method.particles)
         if not np.isfinite(scatter):
-            return "the particle filter comes to no number at its top"
+            return "the particle filter is not finite at its maximum"
         if scatter > HOPELESS:
             return (
-                f"twisted particle filters of {self.particles} particles tell log Z to no better "
-                f"than {scatter:.2g}"
+                f"the sd of log Z is {scatter:.2g} with twisted particle filters of "
+                f"{self.particles} particles"
             )
         return found
 

@@ -302,7 +302,7 @@ def _beyond(
             return maximum_near(setup, method, top, number), False
         except KeyboardInterrupt:
             pass
-    return NotApplicable("interrupted before the top was looked for"), True
+    return NotApplicable("interrupted before the maximum was located"), True
 
 
 def maximum_near(
@@ -310,9 +310,9 @@ def maximum_near(
 ) -> LocalMaximum | NotApplicable:
     """The top near where `number` runs ended, unless the likelihood there is below theirs."""
     if not ends.value > -np.inf:
-        return NotApplicable("the likelihood is zero where the swarms ended")
+        return NotApplicable("the likelihood is zero where the IF2 runs ended")
     noise = ends.noise * np.sqrt(method.evaluations)
-    with announced("IF2", "looking for the top", shown=setup.progress):
+    with announced("IF2", "locating the maximum", shown=setup.progress):
         found = local_maximum(setup, method, ends.z, noise)
     if isinstance(found, NotApplicable):
         return found
@@ -322,7 +322,7 @@ def maximum_near(
         value, error = -np.inf, 0.0
     gain = value - ends.value + (setup.log_prior(found.z) - setup.log_prior(ends.z))
     if not gain > -HALF_INTERVAL - 2.0 * np.hypot(error, ends.noise):
-        return NotApplicable("where the fitted quadratic has its top, the likelihood is low")
+        return NotApplicable("where the fitted quadratic has its maximum, the likelihood is low")
     return found
 
 
@@ -381,7 +381,7 @@ def _report(
 ) -> dict[str, Any]:  # fmt: skip
     names, agree = _owners(setup), int(top.near.sum())
     noise = f", Monte Carlo error {top.noise:.2g}" if top.noise > 0.0 else ""
-    what = f"the {agree} swarms that agree" if top.pooled else f"swarm {top.best + 1}"
+    what = f"the {agree} runs that agree" if top.pooled else f"run {top.best + 1}"
     ends_by_name = [
         unpack_parameters(setup.problem.trace, setup.space.parameters(z)[0]) for z in ends
     ]
@@ -401,7 +401,7 @@ def _report(
         report["without_effect"] = _named(names, ~model.acting)
     if report["converged"] is False:
         report["stopped"] = (
-            f"no other of the {len(ends)} swarms ended near the best one: give more iterations, "
+            f"no other of the {len(ends)} runs ended near the best one: give more iterations, "
             "larger perturbations or more starts"
         )
     return report

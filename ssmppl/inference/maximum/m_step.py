@@ -104,7 +104,8 @@ class _Mean:
             value, gradient = float(self.weights @ values), self.weights @ gradients
             if reason := self.transform.without_slope(value, point.theta, gradient):
                 raise SamplingError(
-                    f"the log density of the states cannot be climbed: {reason}", fix=ELSEWHERE
+                    f"the log density of the states cannot be maximised (no gradient): {reason}",
+                    fix=ELSEWHERE,
                 )
         return here
 

@@ -206,9 +206,9 @@ def local_maximum(
     for _ in range(FINAL_ROUNDS):
         if search.hopeless >= PATIENCE:
             return NotApplicable(
-                f"too much noise to find the top of the likelihood: relative error "
-                f"{np.sqrt(search.misfit):.1f} by {search.runs} filters of {method.particles} "
-                "particles"
+                "Monte Carlo error too large to locate the maximum of the likelihood: relative "
+                f"error {np.sqrt(search.misfit):.1f} by {search.runs} filters of "
+                f"{method.particles} particles"
             )
         runs = search.runs
         fit = search.look(points, True)
@@ -229,7 +229,7 @@ def local_maximum(
             information = information + setup.transform.curvature(top, nothing).log_prior
         moved = float(np.linalg.norm(np.linalg.solve(f, top - z)))
         return LocalMaximum(top, f @ error @ f.T, information, points, runs, moved)
-    return NotApplicable("the likelihood has no top within reach of the points round the end")
+    return NotApplicable("the likelihood has no maximum within the fitted region")
 
 
 def log_densities(

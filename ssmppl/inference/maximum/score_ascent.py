@@ -175,7 +175,7 @@ def _slope(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> Score
         raise SamplingError(
             "the log joint density has no finite second derivative at "
             f"{spelled(setup.problem.trace, setup.transform.at(z).theta)}",
-            fix="give start={name: value} off the edges of the laws, or use IF2",
+            fix="give start={name: value} off the edges of the distributions, or use IF2",
         )
     return slope
 

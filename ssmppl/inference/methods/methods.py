@@ -417,7 +417,7 @@ class IF2:
 
     Parameters
     ----------
-    particles : N of the swarm, and of the filters that evaluate the likelihood at its end.
+    particles : N of each run, and of the filters that evaluate the likelihood at its end.
     iterations : passes over the data.
     cooling : what is left of the steps' standard deviation after 50 iterations; it falls
         geometrically, from row to row. 1: no cooling.
@@ -425,16 +425,16 @@ class IF2:
         theta, for a positive parameter): one number, or by the names of parameters. Those that are
         not named have 0.02. A parameter of the initial law alone has the root of the number of rows
         times as much, at most ten times, unless it is named.
-    starts : number of swarms, the first at the start, the others dispersed round it; or a list of
+    starts : number of runs, the first at the start, the others dispersed round it; or a list of
         their parameter values. The top is looked for from the end of highest log-likelihood, or
         from the mean of those that agree with it where that is higher still.
     averaged : last iterations that an end is the mean of, on the unconstrained scale.
     evaluations : estimates of the likelihood at each end.
-    points : places at which the likelihood is estimated round where the swarms ended, to find the
+    points : places at which the likelihood is estimated round where the runs ended, to find the
         top there. The estimate is the top of a quadratic fitted to them, its curvature gives the
         standard errors, and the noise of the estimates its Monte Carlo error (Ionides, Bretó, Park,
         Smith and King 2017). None: 24 for each coefficient of the quadratic, at least 160. 0: none
-        of this; the estimate is where the swarms ended, how far that is off is not known, and only
+        of this; the estimate is where the runs ended, how far that is off is not known, and only
         an exact likelihood gives standard errors.
     """
 

@@ -28,6 +28,6 @@ def need_density(trace: Trace, method: str, verb: str) -> None:
     raise ArgumentError(
         f"{method} needs the density of the states: {reason.reason}",
         fix=f"use {WITHOUT[verb][0 if linear else 1]}, which needs none; or write components that "
-        "follow without a noise of their own as states of law ssm.Dirac",
+        "follow without a noise of their own as states of distribution ssm.Dirac",
         where=reason.where,
     )

@@ -116,7 +116,7 @@ def choose_kernel(
         raise ArgumentError(
             f'kernel="rejection" needs a bound of the transition density over the state before: '
             f"{height.reason}",
-            fix='use kernel="exact", which has the same law, or "auto"',
+            fix='use kernel="exact", which has the same distribution, or "auto"',
             where=height.where,
         )
     if kernel != "auto":
@@ -130,7 +130,10 @@ def choose_kernel(
             "exact kernel too expensive for so many steps"
         )
     if not isinstance(height, NotApplicable) and settings.particles >= MANY:
-        return "rejection", "the transition density has a bound, and the law is that of the exact"
+        return (
+            "rejection",
+            "the transition density has a bound, and the distribution is that of the exact",
+        )
     if isinstance(height, NotApplicable):
         return "exact", f"no rejection: {height.reason}"
     return "exact", "with few particles rejection does not pay"

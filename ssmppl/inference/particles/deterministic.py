@@ -152,8 +152,8 @@ class Deterministic(Scored):
             if "score" in found.differences:
                 raise ArgumentError(
                     f"the states have no derivatives in closed form: {found.differences['score']}",
-                    fix="write the law by functions that have derivatives, or use a method without "
-                    "scores",
+                    fix="write the distribution by functions that have derivatives, or use a "
+                    "method without scores",
                 )
             self._scores[key] = found
         return self._scores[key].of(problem)

@@ -90,7 +90,7 @@ def collapse(
     text = (
         f"particle degeneracy at t={worst + 1}{label}: only {count} distinct "
         f"particle{'s' if count > 1 else ''} among {draws} draws, and too few at {len(rows) - 1} "
-        f"other rows; the spread of the draws is not that of the posterior there. {fix}"
+        f"other rows; the smoothing variance is underestimated there. {fix}"
     )
     warnings.warn(text, stacklevel=4)
     return {"smoothing_warning": text}

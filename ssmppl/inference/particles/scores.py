@@ -178,8 +178,8 @@ def complete_scores(problem: Problem, fixed: Collection[str] = ()) -> CompleteSc
         if reason is not None:
             raise ArgumentError(
                 f"the score in {s!r} is not the mean of complete-data scores: {reason.reason}",
-                fix=f"fix {s.data[1]!r}, write the law so that it changes smoothly with it, or use "
-                "a method without scores",
+                fix=f"fix {s.data[1]!r}, write the distribution so that it changes smoothly with "
+                "it, or use a method without scores",
                 where=reason.where,
             )
     return CompleteScores(problem, derived)
@@ -249,7 +249,8 @@ def one_run(
         raise SamplingError(
             f"the log joint density has no finite derivative in {', '.join(bad)} on a trajectory "
             f"drawn at {spelled(scores.problem.trace, theta)}",
-            fix="keep parameters and states off the edges where a law's density is 0 or infinite",
+            fix="keep parameters and states off the edges where a distribution's density is 0 or "
+            "infinite",
         )
     hessian = scores.hessian(theta, paths).mean(axis=0) if second else None
     with np.errstate(over="ignore", invalid="ignore"):  # as in `combine`

@@ -24,19 +24,19 @@ FILTER = dict(zip((KalmanModel, HiddenMarkov, Deterministic, Extended), EXACT, s
 FILTER_NAME = {
     KalmanModel: "the Kalman filter",
     HiddenMarkov: "the forward algorithm",
-    Deterministic: "running the states once",
+    Deterministic: "one deterministic simulation",
     Extended: "the extended Kalman filter",
 }
 KIND = {
     KalmanModel: "linear Gaussian",
-    HiddenMarkov: "of finitely many states",
-    Deterministic: "without noise in its states",
+    HiddenMarkov: "finite-state (hidden Markov)",
+    Deterministic: "noise-free in its states",
     Extended: "one that calls a simulator",
 }
 NEEDED = {
     "kalman": "linear Gaussian model",
-    "forward": "model of finite states",
-    "deterministic": "model without noise in its states",
+    "forward": "finite-state (hidden Markov) model",
+    "deterministic": "model with noise-free states",
     "extended": "model that calls a simulator",
 }
 _FORMS: dict[str, Callable[[Trace], ExactModel | NotApplicable]] = {
@@ -79,7 +79,7 @@ def likelihood_by(model: ExactModel) -> str:
 
 
 def exact_kind(model: ExactModel | NotApplicable) -> str | NotApplicable:
-    """ "linear Gaussian", "of finitely many states" or "without noise in its states"; of a model
+    """ "linear Gaussian", "finite-state (hidden Markov)" or "noise-free in its states"; of a model
     that is not exact, why not."""
     return model if isinstance(model, NotApplicable) else KIND[type(model)]
 

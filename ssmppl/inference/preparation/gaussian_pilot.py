@@ -102,7 +102,7 @@ _tuned: dict[tuple, TunedParticles | None] = {}
 
 
 def gaussian_pilot(space: Space, kind: str) -> GaussianPilot | None:
-    """The mode of the approximate posterior; None where the approximation comes to no number, or
+    """The mode of the approximate posterior; None where the approximation is not finite, or
     its posterior to no mode. It has random numbers of its own, the same for every call, and is
     remembered for each program, data and start, as `sample` asks for it twice."""
     where = space.theta.tobytes(), space.z.tobytes(), space.free.tobytes()
@@ -208,7 +208,7 @@ def _covariance(
 def tune_twisted(problem: Problem, theta: np.ndarray, target: float) -> TunedParticles | None:
     """The fewest particles of the twisted filter by which log Z has at most the target's standard
     deviation at theta; the best of those tried where none has; None where there is no filter, or
-    it comes to no number. Remembered, as the pilot."""
+    it is not finite. Remembered, as the pilot."""
     key = (problem.program.path, digest_of(problem), theta.tobytes(), target)
     if key not in _tuned:
         _tuned[key] = _tried_numbers(problem, theta, target)

@@ -57,15 +57,16 @@ def choose_sampler(
     """
     if isinstance(kind, NotApplicable) and twisted is not None:
         return PMMH(proposal="twisted"), (
-            "the states have a Gaussian approximation, and twisted particle filters along it know "
-            f"the likelihood (sd of log Z {twisted.sd:.2g} with {twisted.particles} particles, by "
-            "a pilot): Metropolis-Hastings over them, with proposals from the approximate posterior"
+            "the states have a Gaussian approximation, and twisted particle filters along it "
+            f"estimate the likelihood precisely (sd of log Z {twisted.sd:.2g} with "
+            f"{twisted.particles} particles, by a pilot): Metropolis-Hastings over them, with "
+            "proposals from the approximate posterior"
         )
     if isinstance(kind, NotApplicable) and laplace:
         other, why = choose_sampler(kind, updates, numbers, stuck, singular, counted=counted)
         return PMMH(), (
-            "over twisted particle filters, where a pilot on the data finds that these know the "
-            f"likelihood; else {type(other).__name__}: {why}"
+            "over twisted particle filters, where a pilot on the data finds that these estimate "
+            f"the likelihood precisely; else {type(other).__name__}: {why}"
         )
     if singular is not None and kind != KIND[Extended]:
         if isinstance(kind, NotApplicable):
@@ -74,14 +75,14 @@ def choose_sampler(
                 f"{singular.reason}: random-walk Metropolis on the particle filter's likelihood",
             )
         return MetropolisHastings(), (
-            f"{kind}, and {singular.reason}: a random walk on the exact likelihood, "
-            "which needs none"
+            f"the model is {kind}, and {singular.reason}: a random walk on the exact "
+            "likelihood, which needs none"
         )
     if isinstance(kind, NotApplicable):
         if not stuck and counted and numbers <= FEW:
             return PMMH(), (
-                "the states are counts, given whose trajectory parameters mix slowly: random-walk "
-                "Metropolis on the particle filter's likelihood"
+                "the states are counts; parameters mix slowly conditional on the states: "
+                "random-walk Metropolis on the particle filter's likelihood"
             )
         if not stuck:
             return PGAS(interweave="auto"), (
@@ -109,11 +110,12 @@ def choose_sampler(
     if not open_:
         if not updates:
             return Gibbs(), (
-                f"{kind}, without free parameters: exact trajectories by backward sampling"
+                f"the model is {kind}, without free parameters: exact trajectories by backward "
+                "sampling"
             )
         reason = (
-            f"{kind}, and every parameter has a closed-form conditional: exact trajectories by "
-            "backward sampling"
+            f"the model is {kind}, and every parameter has a closed-form conditional: exact "
+            "trajectories by backward sampling"
         )
         if kind != "linear Gaussian":
             return Gibbs(), reason
@@ -124,12 +126,12 @@ def choose_sampler(
     named = ", ".join(dict.fromkeys(open_))
     if numbers <= FEW:
         return MetropolisHastings(), (
-            f"{kind}, but {named} has no closed-form conditional: random-walk Metropolis on the "
-            "exact likelihood"
+            f"the model is {kind}, but {named} has no closed-form conditional: random-walk "
+            "Metropolis on the exact likelihood"
         )
     return Gibbs(), (
-        f"{kind}, with {numbers} parameters, too many for a random walk: exact trajectories, and "
-        f"slice sampling for {named}"
+        f"the model is {kind}, with {numbers} parameters, too many for a random walk: exact "
+        f"trajectories, and slice sampling for {named}"
     )
 
 
@@ -156,7 +158,7 @@ def why_stuck(trace: Trace, rows: int | None) -> str:
         "impossible"
     )
     if only_counts(trace):
-        return f"{reason}, and given a trajectory of counts parameters mix slowly"
+        return f"{reason}, and parameters mix slowly conditional on a trajectory of counts"
     if rows is None or rows > ROWS_WITHOUT_ANCESTORS:
         return f"{reason}; with more than {ROWS_WITHOUT_ANCESTORS} rows early states mix slowly"
     return ""
@@ -191,7 +193,7 @@ def choose_maximiser(
     if kind == KIND[Extended]:
         return DirectOptimization(), (
             f"the model is {kind}: the likelihood of the extended Kalman filter, an approximation, "
-            "is climbed by differences"
+            "is maximised with finite-difference gradients"
         )
     if not isinstance(kind, NotApplicable):
         return DirectOptimization(), (
@@ -199,7 +201,7 @@ def choose_maximiser(
         )
     if laplace is None:
         return DirectOptimization(), (
-            "the states have a Gaussian approximation, whose likelihood is climbed and then "
+            "the states have a Gaussian approximation, whose likelihood is maximised and then "
             "corrected by particle filters"
         )
     obstacle = smooth_filter_applies(trace)

@@ -58,7 +58,7 @@ def without_maximum(
             elif some and not exact.all():
                 how = f"determine the states exactly in {np.sum(exact)} rows"
             else:
-                how = "can be followed exactly by the model"
+                how = "are fitted exactly"
             return NotApplicable(
                 f"the likelihood has no maximum: the data of {symbol!r} {how}, so that it grows "
                 "without bound as the variances of the noises go to zero",
@@ -97,7 +97,7 @@ def check_mode(model: ExactModel, experiments: Iterable[Experiment], theta: np.n
     reason = without_maximum(model, experiments, theta, rows=2)
     if reason is not None:
         raise SamplingError(
-            f"{reason.reason}, and the prior does not hold them; parameters: "
+            f"{reason.reason}, and the prior does not bound them away from zero; parameters: "
             f"{spelled(model.trace, theta)}",
             fix="check this column; else hold a variance by fixed={...}, or give it a prior that "
             "keeps it off zero, as ssm.InverseGamma does",

@@ -60,10 +60,10 @@ def mixing_attributes(
     worst = int(np.argmax(r_hat) if apart else np.argmin(ess))
     others = int(bad.sum()) - 1
     text = (
-        ("the chains have not mixed" if apart else "the chains hold too few independent draws")
+        ("the chains have not mixed" if apart else "effective sample size too small")
         + f": R-hat of {labels[worst]} is {r_hat[worst]:.3g}, its bulk ESS {ess[worst]:.3g}"
-        + (f"; {others} other parameters are like it" if others > 1 else "")
-        + ("; one other parameter is like it" if others == 1 else "")
+        + (f"; {others} other parameters also fail" if others > 1 else "")
+        + ("; 1 other parameter also fails" if others == 1 else "")
         + f". R-hat has to be below {APART:g} and the ESS at least {FEW:g} before means and "
         f"intervals are used. Take more draws (there were {n} of each chain) and warmup ({warmup})"
         + advice

@@ -53,7 +53,11 @@ def law_without_density_at(trace: Trace, theta: np.ndarray) -> tuple[str, str, L
             for law in _laws_in(site.distribution):
                 found = _of_one(law, known, []) or _covariance(law, known)
                 if found is not None:
-                    return f"{found[0]}, in the law of {name}", found[1], site.distribution.location
+                    return (
+                        f"{found[0]}, in the distribution of {name}",
+                        found[1],
+                        site.distribution.location,
+                    )
     return None
 
 

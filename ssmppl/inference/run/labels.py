@@ -42,7 +42,7 @@ def model_attributes(trace: Trace) -> dict[str, Any]:
     """The attributes of every result that are about the model: its name, and which of its laws
     are approximations of what was declared, as that of a non-linear `SDE`."""
     told = "; ".join(f"{name}: {text}" for name, text in trace.approximations.items())
-    return {"model": trace.name} | ({"approximate_laws": told} if told else {})
+    return {"model": trace.name} | ({"approximate_distributions": told} if told else {})
 
 
 def observes(trace: Trace) -> dict[str, str]:

@@ -106,7 +106,7 @@ class Problem:
         if isinstance(found, NotApplicable):
             fix = 'use proposal="auto" or "bootstrap"'
             if flat_start(self.trace):
-                fix = "use an exact method, or give the state a proper law in @initial"
+                fix = "use an exact method, or give the state a proper distribution in @initial"
             raise ArgumentError(f"proposal={name!r} does not apply: {found}", fix=fix)
         if name in MARGINAL and not integrate:
             raise ArgumentError(
@@ -136,7 +136,7 @@ def pose(model: Model, data: Any) -> Problem:
     if not traced.observations:
         raise ModelError(
             f"model {traced.name!r} has no @observation function: there is nothing to condition on",
-            fix="declare the law of y_t with @model.observation",
+            fix="declare the distribution of y_t with @model.observation",
             where=model.location,
         )
     experiments = tuple(bind(traced, data))

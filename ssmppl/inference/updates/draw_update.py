@@ -246,7 +246,7 @@ class UpdateSampler:
             f"value: {named}",
             fix="start inside the support; given these states no value near is possible. Where "
             "a covariance is singular no density exists: give components that follow without "
-            "a noise of their own the law Dirac",
+            "a noise of their own the distribution Dirac",
             where=self.update.where,
         )
 

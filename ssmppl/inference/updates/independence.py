@@ -221,7 +221,7 @@ def mode_of(space: Space, model: Extended, rng: np.random.Generator) -> Any:
     found = climb_together(density, points[np.argsort(-density(points))[:CLIMBS]])
     if found is None:
         raise ArgumentError(
-            "the extended Kalman filter comes to no number at every point that was tried",
+            "the extended Kalman filter is not finite (NaN or infinite) at every point tried",
             fix="give start={name: value} near plausible values, or look whether the simulator "
             "gives NaN",
         )

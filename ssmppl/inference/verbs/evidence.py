@@ -154,7 +154,7 @@ def evidence(
     if draws * chains < 2 * POINTS * (d + 1):
         raise ArgumentError(
             f"draws={draws} of each of {chains} chain{'s' if chains > 1 else ''}: half of them are "
-            f"too few to fit a law of {d} number{'s' if d > 1 else ''} to",
+            f"too few to fit a distribution of {d} number{'s' if d > 1 else ''} to",
             fix=f"give at least {-(-2 * POINTS * (d + 1) // chains)} draws",
         )
     result = sample(
@@ -179,9 +179,9 @@ def evidence(
     other_ratio = np.concatenate(density) - law.log_density(points)
     if not np.any(other_ratio > -np.inf):
         raise SamplingError(
-            "the likelihood is zero wherever a t law with the draws' mean and covariance puts its "
-            "points, so that there is nothing to compare the draws with",
-            fix="give more draws, or method=ssm.SMC2(), which needs no such law",
+            "the likelihood is zero at all draws from the fitted t proposal, so that there is "
+            "nothing to compare the draws of the posterior with",
+            fix="give more draws, or method=ssm.SMC2(), which needs no such distribution",
         )
     found, check = bridge(own_ratio, other_ratio), importance(other_ratio)
     known = _log_prior_of_fixed(problem, fixed_values)
@@ -242,8 +242,8 @@ def _chosen(
         )
     if isinstance(method, PMMH) and method.correlation:
         raise ArgumentError(
-            f"correlation={method.correlation!r}: its filter sorts the particles, so that its "
-            "estimates have another law than the fresh ones that the bridge needs",
+            f"correlation={method.correlation!r}: its "
+            "correlated estimates have a different distribution from the independent ones needed",
             fix="leave correlation=0 for the evidence",
         )
     return method

@@ -52,7 +52,7 @@ from ssmppl.language.user_defined.primitive import primitives_in
 
 PAGE = 100  # columns
 LONGEST_LAW = 600  # characters of a law, some six lines
-MOST_NAMED = 8  # columns that are not read
+MOST_NAMED = 8  # unused columns
 UPDATES = "Gibbs updates (full conditionals given states and data)"
 TEMPERED = (
     "for observations far more informative than the transition: particles are weighted by "
@@ -105,12 +105,12 @@ class Plan:
         first = {n: s for n, s in t.initial.items() if n not in t.auxiliary}
         out = [
             ("Priors", _laws(t.parameters)),
-            ("Initial law, t = 1", _laws(first)),
+            ("Initial distribution, t = 1", _laws(first)),
             ("Transition, x_prev to x", _laws(t.transition, t.auxiliary)),
             ("Observation", _laws(t.observations)),
         ]
         if loops := _loops(t):
-            out.append(("Small steps", loops))
+            out.append(("Numerical integration", loops))
         if t.inputs:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
                                    for n, s in t.inputs.items()]))  # fmt: skip
@@ -138,13 +138,13 @@ class Plan:
     def _structure(self) -> list[tuple[str, str]]:
         if isinstance(self.finite, FiniteStates):
             return [("finite states", f"{len(self.finite.values)} combinations of values: the "
-                     "likelihood is exact, by the forward algorithm; particles are used only where "
-                     "they are asked for")]  # fmt: skip
+                     "likelihood is exact, by the forward algorithm; particles are used only on "
+                     "request")]  # fmt: skip
         if isinstance(exact_model(self.trace), Extended):
             return self._simulators()
         if isinstance(exact_model(self.trace), Deterministic):
             return [("no noise", "given the parameters the states are known: the likelihood is "
-                     "exact, by running them once")]  # fmt: skip
+                     "exact, from one deterministic simulation")]  # fmt: skip
         if isinstance(self.structure, NotApplicable):
             found = [("nonlinear", f"not linear Gaussian: {reason_and_line(self.structure)}")]
             found.append(("Laplace approximation", self._laplace()))
@@ -152,7 +152,7 @@ class Plan:
                 found.append(("conditionally linear Gaussian", _integrated(self.conditional)))
             return found
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
-                 "used only where they are asked for")]  # fmt: skip
+                 "used only on request")]  # fmt: skip
 
     def _primitives(self) -> list[tuple[str, str]]:
         """Where the derivatives of opaque functions come from."""
@@ -168,17 +168,18 @@ class Plan:
             ("simulator", f"{names}: its values and derivatives, by central differences, come from "
              "one call for all points of a row"),
             ("approximation", "the likelihood is that of the extended Kalman filter, whose update "
-             "is the mode of each row: maximize, sample, smooth, score and kalman_filter go by it; "
-             "particles, proposal=\"bootstrap\", are used where they are asked for"),
+             "is the mode of each row: maximize, sample, smooth, score and kalman_filter use it; "
+             "particles, proposal=\"bootstrap\", are used only on request"),
         ]  # fmt: skip
 
     def _laplace(self) -> str:
         if self.laplace is not None:
             return f"none: {reason_and_line(self.laplace)}"
-        return ("an approximation to the likelihood at the mode of the states, where maximize "
-                "begins, PMMH takes its proposals from and ISMCMC runs its chains; log_likelihood, "
-                "kalman_filter, smooth and forecast give it by proposal=\"laplace\", extended and "
-                "unscented Kalman filters by \"extended\" and \"unscented\"")  # fmt: skip
+        return ("an approximation to the likelihood at the mode of the states, used to initialise "
+                "maximize, as proposal in PMMH and as target in ISMCMC; available in "
+                "log_likelihood, kalman_filter, smooth and forecast through proposal=\"laplace\", "
+                "extended and unscented Kalman filters through \"extended\" and "
+                "\"unscented\"")  # fmt: skip
 
     def _proposal(self, name: str, proposal: Proposal | NotApplicable) -> tuple[str, str]:
         if isinstance(proposal, NotApplicable):
@@ -251,7 +252,7 @@ def _laws(sites: dict[str, Site], auxiliary: Collection[str] = ()) -> list[tuple
     for s in sites.values():
         rows.append((s.name, _cut(f"~ {s.distribution!r}")))
         if s.name in auxiliary:
-            rows.append(("", "a draw of the step, without a value at the first row"))
+            rows.append(("", "auxiliary variable of the transition, undefined at t = 1"))
         if s.distribution.approximation:
             rows.append(("", s.distribution.approximation))
     return rows
@@ -372,7 +373,7 @@ def _unread(
     named = ", ".join(columns[:MOST_NAMED]) + (", ..." if len(columns) > MOST_NAMED else "")
     if all(e.time is None for e in experiments):
         named += "; rows have numbers: call a column of times or dates `time` to name them"
-    return (("not read", named),)
+    return (("unused columns", named),)
 
 
 def compile(model: Model, data: Any = None) -> Program:

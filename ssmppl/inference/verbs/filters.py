@@ -287,7 +287,7 @@ def kalman_filter(
     ------
     ArgumentError : the model is not linear and Gaussian, or has no such approximation; gives the
         reason and the user's line.
-    SamplingError : an approximation comes to no number.
+    SamplingError : an approximation is not finite.
     """
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)

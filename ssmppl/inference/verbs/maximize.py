@@ -113,7 +113,7 @@ def maximize(
     if method is not None and type(method) not in METHODS:
         names = ", ".join(f"ssm.{c.__name__}(...)" for c in METHODS)
         raise ArgumentError(
-            f"method={method!r} is no method of maximisation",
+            f"method={method!r} is not a maximisation method",
             fix=written_as(method, METHODS) or f"use {names} or None",
         )
     check_executor(executor)
@@ -243,7 +243,7 @@ def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> n
         labels = [repr(s) for s in setup.problem.trace.parameter_symbols]
         attrs["held_at_edge"] = {labels[i]: edge for i, edge in found.components.items()}
         if not found.kept.any():
-            attrs["covariance"] = "every parameter is at an edge of what it can be"
+            attrs["covariance"] = "every parameter is at the boundary of its parameter space"
             return nothing
         if ascent.information is None:
             information = _information(setup, ascent.theta, found)
@@ -258,7 +258,7 @@ def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> n
         return nothing
     attrs["covariance"] = "inverse observed information"
     if found is not None:
-        attrs["covariance"] += f", with {', '.join(attrs['held_at_edge'])} held at the edge"
+        attrs["covariance"] += f", with {', '.join(attrs['held_at_edge'])} held at the boundary"
     return covariance
 
 
@@ -304,7 +304,7 @@ def natural_covariance(
     try:
         z = setup.space_at(theta) if found is None else found.z
     except (ValueError, np.linalg.LinAlgError):
-        return NotApplicable("the estimate lies on the edge of what the parameters can be")
+        return NotApplicable("the estimate lies on the boundary of the parameter space")
     kept = np.ones(len(z), dtype=bool) if found is None else found.kept
     point = setup.transform.at(z)
     jacobian = point.jacobian[:, kept]

@@ -161,7 +161,7 @@ def predict(
     if not traced.observations:
         raise ModelError(
             f"model {traced.name!r} has no @observation function: there is nothing to predict",
-            fix="declare the law of y_t with @model.observation",
+            fix="declare the distribution of y_t with @model.observation",
             where=model.location,
         )
     posterior = None

@@ -164,7 +164,7 @@ def sample(
     if sampling_method is None:
         names = ", ".join(f"ssm.{m.__name__}(...)" for m in METHODS)
         raise ArgumentError(
-            f"method={method!r} is no method of sampling",
+            f"method={method!r} is not a sampling method",
             fix=written_as(method, METHODS) or f"use {names} or None",
         )
     if not sampling_method.markov:

@@ -201,8 +201,8 @@ def _score(
     slopes = zip(labels, found.gradient[free], strict=True)
     if none := [f"{n} is {g:g}" for n, g in slopes if not np.isfinite(g)]:
         warnings.warn(
-            f"the log-likelihood has no finite slope at these parameters, as at the root or the "
-            f"logarithm of 0: the score in {', '.join(none)}",
+            "gradient is not finite at these parameters (e.g. sqrt or log at 0): the score in "
+            f"{', '.join(none)}",
             stacklevel=3,
         )
     return Score(

@@ -113,8 +113,8 @@ def check_drawable(traced: Trace) -> None:
     check_samplers(traced)
     for site in flat_start(traced):
         raise ModelError(
-            f"the initial law of {site.name!r} is Flat, and cannot be drawn from",
-            fix="give it a proper law in @initial to simulate",
+            f"the initial distribution of {site.name!r} is Flat, and cannot be drawn from",
+            fix="give it a proper distribution in @initial to simulate",
             where=site.distribution.location,
         )
 
@@ -158,8 +158,8 @@ def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) ->
             known |= dict(zip(before, states[draw, t - 1], strict=False))
             why, fix = out_of_range(site.distribution, known) or (
                 "",
-                "a parameter of its law leaves its range there (a negative spread, the log of a "
-                "negative number, ...): check the values, or bound them by np.maximum",
+                "a distribution parameter is outside its valid range there (a negative spread, the "
+                "log of a negative number, ...): check the values, or bound them by np.maximum",
             )
             raise SamplingError(
                 f"{symbols[k]!r} is nan at t={t + 1} of draw {draw + 1}" + (why and f": {why}"),

@@ -236,8 +236,8 @@ def by_fixed_lag(setup: SmoothingSetup, method: FixedLag) -> list[SmoothedStates
     """Moments, each row's from the ancestors of particles some rows later."""
     if setup.trajectories is not None:
         raise ArgumentError(
-            f"trajectories={setup.trajectories}: FixedLag knows marginals only, no joint law to "
-            "draw trajectories from",
+            f"trajectories={setup.trajectories}: FixedLag knows marginals only, no joint "
+            "distribution to draw trajectories from",
             fix="leave trajectories= out, or use ssm.FFBSi()",
         )
     settings = _filter(setup, method)
@@ -424,7 +424,7 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
     if kind is None:
         names = ", ".join(f"ssm.{t.__name__}(...)" for t in METHODS)
         raise ArgumentError(
-            f"method={method!r} is no method of smoothing",
+            f"method={method!r} is not a smoothing method",
             fix=written_as(method, METHODS) or f"use {names}, a name, or None",
         )
     if isinstance(method, KalmanSmoother) and method.proposal in APPROXIMATE:

@@ -126,7 +126,7 @@ def _check_alone(index: Expr, elements: int, own: _Values, where: Location) -> N
             f"the index {to_text(index)} takes a continuum of values, and there are {elements} "
             f"elements, 0 to {last}",
             fix=f"make it a whole number, np.clip(np.floor({to_text(index)}), 0, {last}); a state "
-            "can have a law of whole numbers, such as Categorical",
+            "can have a distribution of whole numbers, such as Categorical",
             where=where,
         )
     if own.unbounded:
@@ -134,7 +134,7 @@ def _check_alone(index: Expr, elements: int, own: _Values, where: Location) -> N
             f"the index {to_text(index)} has no bound, and there are {elements} elements, 0 to "
             f"{last}",
             fix=f"bound it, as in np.minimum({to_text(index)}, {last}), or give "
-            f"{index.data[1]!r} a bounded law",
+            f"{index.data[1]!r} a bounded distribution",
             where=where,
         )
 

@@ -91,7 +91,7 @@ def check_draws_of_step(
     for name, site in transition.items():
         if name not in initial and name not in new.read:
             raise ModelError(
-                f"@transition gives {name!r}, which has no initial law",
+                f"@transition gives {name!r}, which has no initial distribution",
                 fix=f"return it from @initial too; @initial gives: {listing(name, initial)}; what "
                 f"is drawn within a step only needs none, and is read as {name + SUFFIX!r} by a "
                 "later @transition function",
@@ -138,7 +138,7 @@ class Refusal:
                 f"{asks}, which {giver.__name__} gives ({where}), and that waits for what "
                 f"{function.__name__} gives: a cycle",
                 f"let one of the two depend on the value before, {name!r}, or draw both from one "
-                "law of a vector, such as ssm.MvNormal",
+                "distribution of a vector, such as ssm.MvNormal",
             )
         return (
             f"{asks}, which {giver.__name__} gives further below ({where})",
@@ -197,7 +197,7 @@ class Refusal:
             return None
         if all(name not in self.names_given(f) for f in self.functions):
             return None
-        found = f"{name!r} is drawn within a step and has no initial law, so that it has no value "
+        found = f"{name!r} is drawn within a step and has no initial distribution, hence no value "
         if role == "transition":
             return (
                 found + "before",
@@ -209,8 +209,8 @@ class Refusal:
     @staticmethod
     def _as_state(name: str) -> str:
         return (
-            f"give {name!r} an initial law, its value at the first row, as ssm.Dirac(0), and it is "
-            "a state"
+            f"give {name!r} an initial distribution, its value at the first row, as ssm.Dirac(0), "
+            "and it is a state"
         )
 
 

@@ -118,10 +118,10 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
     allowed = role == "prior" or (role == "initial" and kind == "Flat")
     if not distribution.proper and not allowed:
         raise ModelError(
-            f"the law of {name!r} is {kind}, which is improper",
+            f"the distribution of {name!r} is {kind}, which is improper",
             fix=f"use {kind} as a prior"
             + (", or in @initial of a linear Gaussian model" if kind == "Flat" else "")
-            + "; a vague law is one of large spread",
+            + "; a vague distribution is one of large spread",
             where=where,
         )
     if role in ("initial", "transition", "proposal") and not distribution.drawable:
@@ -160,10 +160,10 @@ def check_read(
     for s in symbols_of(distribution.arguments()):
         if s.data[0] not in kinds and s not in handed:
             raise ModelError(
-                f"the law of {name!r} reads {to_text(s)}, a symbol of another law than this "
-                f"@{role}",
-                fix="name what a law needs among its arguments; what one law keeps in a variable "
-                "or a dictionary means nothing in another",
+                f"the distribution of {name!r} reads {to_text(s)}, a symbol of another "
+                f"distribution than this @{role}",
+                fix="name what a distribution needs among its arguments; what one distribution "
+                "keeps in a variable or a dictionary means nothing in another",
                 where=distribution.location,
             )
 
@@ -179,7 +179,7 @@ def check_states(
     for name, site in initial.items():
         if name not in transition:
             raise ModelError(
-                f"state {name!r} has an initial law but no transition",
+                f"state {name!r} has an initial distribution but no transition",
                 fix=f"return {name!r} from a @transition function too; the transitions give: "
                 f"{listing(name, transition)}",
                 where=site.distribution.location,
@@ -197,7 +197,7 @@ def _check_against_initial(role: str, name: str, site: Any, initial: Mapping[str
     where = site.distribution.location
     if name not in initial:
         raise ModelError(
-            f"@{role} gives {name!r}, which has no initial law",
+            f"@{role} gives {name!r}, which has no initial distribution",
             fix=f"return it from @initial too; @initial gives: {listing(name, initial)}",
             where=where,
         )
@@ -205,7 +205,7 @@ def _check_against_initial(role: str, name: str, site: Any, initial: Mapping[str
     if site.shape != first.shape:
         raise ModelError(
             f"state {name!r} has shape {site.shape} in its {role} and shape "
-            f"{first.shape} in its initial law",
+            f"{first.shape} in its initial distribution",
             fix="give both the same shape; np.zeros(n) makes a mean of length n",
             where=where,
         )
@@ -230,7 +230,7 @@ def _check_proposal(
             if fixed or name in draws:
                 continue
             raise ModelError(
-                f"@proposal gives no law for the state {name!r}",
+                f"@proposal gives no distribution for the state {name!r}",
                 fix=f"return {name!r} from it too; it gives: {listing(name, proposal)}",
                 where=some.where,
             )

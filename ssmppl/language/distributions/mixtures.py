@@ -226,7 +226,7 @@ def _checked(components: Any) -> tuple[Distribution, ...]:
         if law.joint or isinstance(law, (Dirac, Flat)):
             fix = {
                 "Categorical": "mix the probabilities: ssm.Categorical(w * p + (1 - w) * q)",
-                "Dirac": "a law with an atom has no density; zeros among counts are "
+                "Dirac": "a distribution with an atom has no density; zeros among counts are "
                 "ssm.ZeroInflated(law, p)",
             }.get(name, "make the choice a state, ssm.Bernoulli(p) drawn in every row, and select "
                   "the arguments by np.where")  # fmt: skip
@@ -238,7 +238,8 @@ def _checked(components: Any) -> tuple[Distribution, ...]:
         )
         raise ModelError(
             f"Mixture: components of two kinds: {kinds}",
-            fix="mix continuous laws with each other, laws of whole numbers with each other",
+            fix="mix continuous distributions with each other, distributions of whole numbers with "
+            "each other",
             where=where,
         )
     return tuple(components)
@@ -278,7 +279,7 @@ class ZeroInflated(Distribution):
             or not all(e.op == "const" and e.data >= 0.0 for e in law.support().lower.ravel())
         ):
             raise ModelError(
-                f"ZeroInflated: {name} is no law of counts",
+                f"ZeroInflated: {name} is no distribution of counts",
                 fix="give one of whole numbers from 0 on, such as ssm.Poisson(rate)",
                 where=user_location(),
             )

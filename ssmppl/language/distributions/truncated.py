@@ -53,7 +53,7 @@ class Truncated(Distribution):
             raise ModelError(
                 f"Truncated: {dist.origin.name} has no distribution function, or no inverse of it",
                 fix=f"declare both, @{dist.origin.name}.cdf and @{dist.origin.name}.quantile; or "
-                "give the bounds to the law itself, with the density between them",
+                "give the bounds to the distribution itself, with the density between them",
                 where=user_location(),
             )
         if lower is None and upper is None:

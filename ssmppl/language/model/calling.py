@@ -34,7 +34,7 @@ _BUILD = (
 )
 _NO_ELEMENTS = (
     "write the name without brackets and without a loop over it; what has several components is "
-    "declared with a vector law (MvNormal, or arguments that are arrays)"
+    "declared with a vector distribution (MvNormal, or arguments that are arrays)"
 )
 # Python's messages about a scalar symbol: what was asked of it, and what to write instead
 _ASKED_OF_SYMBOLS = tuple(
@@ -57,7 +57,7 @@ _ASKED_OF_SYMBOLS = tuple(
          "write np.sign(x) * np.floor(np.abs(x))"),
         (r"format string passed to Expr",
          "formats a symbol as a number (an f-string, format())",
-         "take the text out of the law: a symbol has no value while the model is traced"),
+         "take the text out of the distribution: a symbol has no value while the model is traced"),
         (r"^'Expr' object is not callable",
          "calls a symbol as a function", "write x * (...) for a product"),
         (r"for divmod\(\).*'Expr'", "asks for divmod() of a symbol", "write x // n and x % n"),
@@ -87,7 +87,7 @@ def call(function: Law, role: str, arguments: dict[str, Any], known: Roles) -> A
     again = call_once(function, role, arguments, known)
     if not _same(first, again):
         raise ModelError(
-            f"@{role} {function.__name__} gives another law when it is called again",
+            f"@{role} {function.__name__} gives another distribution when it is called again",
             fix="draw no random numbers and change nothing inside of it: it runs on symbols, "
             "and randomness belongs into the distributions that it returns",
             where=return_location(function),

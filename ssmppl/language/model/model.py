@@ -125,7 +125,7 @@ class Model:
         if name is not None and not (isinstance(name, str) and name.isidentifier()):
             raise ModelError(
                 f"time_step={name!r}",
-                fix='give the name that laws call it by, time_step="dt"',
+                fix='give the name that distributions call it by, time_step="dt"',
                 where=self.location,
             )
         if unit not in TIME_UNITS:
@@ -224,7 +224,9 @@ class Model:
 
     def _declare(self, role: str, function: Law) -> Law:
         if not (inspect.isfunction(function) or inspect.ismethod(function)):
-            found = f"@{role} of model {self.name!r} stands on {function!r}, which is no function"
+            found = (
+                f"@{role} of model {self.name!r} decorates {function!r}, which is not a function"
+            )
             if function is _MISSING:
                 found = f"@{role} of model {self.name!r} is called without a function"
             raise ModelError(

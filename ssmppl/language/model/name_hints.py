@@ -13,7 +13,7 @@ _NEGATIVE = "ssm.NegativeBinomial(mean, dispersion=)"
 _ZEROS = "ssm.ZeroInflated(ssm.{0}, p), p the probability of a structural zero"
 _HURDLE = "ssm.ZeroInflated(ssm.Truncated(ssm.{0}, lower=1), p), p the probability of zero"
 _MIXTURE = "ssm.Mixture(weights, [ssm.Normal(mean, sd=), ...])"
-_POINT = "ssm.Dirac(value) for a state, or a line of Python in the law that needs it"
+_POINT = "ssm.Dirac(value) for a state, or a line of Python in the distribution that needs it"
 # lower case and without underscores -> what is written here
 HINTS: dict[str, str] = {
     **dict.fromkeys(["gauss", "gaussian", "norm"], _NORMAL),

@@ -166,7 +166,7 @@ class BatchedFunction:
                 "called twice with the same arguments it gives",
                 "keeps something between calls, or draws random numbers",
                 "reset what it keeps at the beginning of each call (a warm start, a clock, a "
-                "generator); noise belongs into the model's laws",
+                "generator); noise belongs into the model's distributions",
             )
         turned = self._called(sample[::-1])[::-1]
         if not self._alike(first, turned):

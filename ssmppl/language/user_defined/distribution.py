@@ -91,7 +91,7 @@ def distribution(
     def declare(function: Function) -> DeclaredDistribution:
         if not inspect.isfunction(function):
             raise ModelError(
-                f"@ssm.distribution stands on {function!r}, which is no function",
+                f"@ssm.distribution decorates {function!r}, which is not a function",
                 fix="write @ssm.distribution(lower=0) on the line above a def",
                 where=user_location(),
             )
@@ -247,12 +247,12 @@ class DeclaredDistribution(Declared):
         verb = self._verb(part)
         if not inspect.isfunction(function):
             found = "is called without a function" if function is _MISSING else (
-                f"stands on {function!r}, which is no function"
+                f"decorates {function!r}, which is not a function"
             )  # fmt: skip
             raise ModelError(
                 f"@{verb} {found}",
                 fix=f"write @{verb} (without parentheses) on the line above a def; to compute "
-                "with the law, make one first by giving its arguments",
+                "with the distribution, make one first by giving its arguments",
                 where=user_location(),
             )
         where = location_of(function)
@@ -393,7 +393,7 @@ def _arguments(function: Function, where: Location, verb: str, least: int = 1) -
         found = f"takes {bad[0]!r}" if bad else "takes no argument"
         raise ModelError(
             f"@{verb} {function.__name__} {found}: arguments are bound by name",
-            fix="give it a first argument and then the law's own, each by its name: "
+            fix="give it a first argument and then the distribution's own, each by its name: "
             f"def {function.__name__}(y, shape, scale)",
             where=where,
         )
@@ -478,7 +478,7 @@ def _fault(
         name = min(map(repr, foreign))
         return (
             f"reads {name} of the model from outside of its arguments",
-            f"give the law an argument for {name}",
+            f"give the distribution an argument for {name}",
         )
     if part == "draw" and not any(n.op == "random" for n in nodes):
         return (

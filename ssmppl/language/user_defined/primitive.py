@@ -341,7 +341,7 @@ def primitive_of(function: Function, derivative: Derivative | None) -> Primitive
     """The primitive of a function."""
     if not inspect.isfunction(function):
         raise ModelError(
-            f"@ssm.primitive stands on {function!r}, which is no function",
+            f"@ssm.primitive decorates {function!r}, which is not a function",
             fix="write @ssm.primitive on the line above a def; what is given of it by name, as in "
             "@ssm.primitive(derivative=...)",
         )

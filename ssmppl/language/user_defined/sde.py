@@ -148,7 +148,7 @@ class SDE:
         for law in laws.values():
             law.location = self.location
         made.approximation = (
-            f"the law of an SDE in {self.steps} small steps of Euler and Maruyama"
+            f"the distribution of an SDE in {self.steps} small steps of Euler and Maruyama"
             + (f": that of the last one; the noises of the others are {noise}" * (self.steps > 1))
         )
         return laws
@@ -186,7 +186,7 @@ class SDE:
         made.location = self.location
         if linear is None or not still:
             made.approximation = (
-                f"the law of an SDE, approximated by its linearisation along the mean, in "
+                f"the distribution of an SDE, approximated by its linearisation along the mean, in "
                 f"{self.steps} steps"
             )
         return made
@@ -296,7 +296,8 @@ def started(
         value = before(name) if role == "transition" else None
         if value is None:
             raise ModelError(
-                f"@{role} {function}: {name!r} is an SDE, which is the law of a state's next value",
+                f"@{role} {function}: {name!r} is an SDE, which is the distribution of a state's "
+                "next value",
                 fix="return it from a @transition function, by the name of a state that an "
                 "@initial function gives",
                 where=where,

@@ -139,7 +139,13 @@ def truncation_point(m):
     laws(m, gamma_prior, transition)
 
 
-@refused("a", "Normal", "Normal(0, variance=1 / (1 - a**2))", "initial law of x", "log(1 - a**2)")
+@refused(
+    "a",
+    "Normal",
+    "Normal(0, variance=1 / (1 - a**2))",
+    "initial distribution of x",
+    "log(1 - a**2)",
+)
 def stationary_start(m):
     """Corrected: the initial law counts."""
 
@@ -155,7 +161,7 @@ def stationary_start(m):
     laws(m, prior, transition, initial)
 
 
-@refused("a", "Normal", "Normal(np.exp(a), sd=1)", "initial law of x", "exp(a)")
+@refused("a", "Normal", "Normal(np.exp(a), sd=1)", "initial distribution of x", "exp(a)")
 def initial_mean(m):
     """Corrected by a Metropolis step: exp(a) x_1 has no upper bound."""
 
@@ -285,7 +291,7 @@ def deterministic(m):
     laws(m, normal_prior, transition, initial)
 
 
-@refused("a", "Gamma", "Beta(a, 2)", "prior law of p", "betaln")
+@refused("a", "Gamma", "Beta(a, 2)", "prior distribution of p", "betaln")
 def child_of_a_hierarchy(m):
     """Corrected by a Metropolis step: one term, however long the series."""
 
@@ -315,7 +321,7 @@ def half_normal_precision(m):
     laws(m, prior, transition)
 
 
-@refused("a", "inverse Gamma", "Gamma(2, rate=1)", "prior law of a")
+@refused("a", "inverse Gamma", "Gamma(2, rate=1)", "prior distribution of a")
 def gamma_on_a_variance(m):
     def transition(x, a):
         return {"x": Normal(x, variance=a)}
@@ -375,7 +381,7 @@ def stationary_covariance(m):
     stationary(m)
 
 
-@refused("Q", "inverse Wishart", "Wishart(5, scale=np.eye(2))", "prior law of Q")
+@refused("Q", "inverse Wishart", "Wishart(5, scale=np.eye(2))", "prior distribution of Q")
 def wishart_on_a_covariance(m):
     def prior():
         return {"Q": Wishart(5, scale=np.eye(2))}

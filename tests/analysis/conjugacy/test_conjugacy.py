@@ -74,7 +74,8 @@ def test_explanations_have_every_part(name):
         assert update.where is not None
         assert all(len(line) < 700 for line in str(explanation).splitlines())
         named = re.findall(
-            r"(?:sampling from|Hastings with) the (.+?) law ", " ".join(str(explanation).split())
+            r"(?:sampling from|Hastings with) the (.+?) distribution ",
+            " ".join(str(explanation).split()),
         )
         assert all(n == update.family_name for n in named), named
 

@@ -82,9 +82,10 @@ def test_explanation_reads_as_the_paper(update):
         "H = sum_{t=2}^{T-1} [x**2]",
         "tau: -0.01 - 0.5*sum_{t=1}^T [x**2]",
         "phi to (-1, 1)",
-        "sqrt(1 - phi**2): the initial law of x",
+        "sqrt(1 - phi**2): the initial distribution of x",
         "corpus.py",
-        "one-at-a-time updates when the joint law is improper (H or the rate not positive)",
+        "one-at-a-time updates when the joint distribution is improper (H or the rate not "
+        "positive)",
     ):
         assert piece in text, text
 

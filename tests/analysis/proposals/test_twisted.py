@@ -238,20 +238,21 @@ def in_shape(p, v):
 REASONS = {
     "no observation": ((None,), "there is no observation", ""),
     "flat start": (
-        (see, lambda: {"p": D.Dirac(0.0), "v": D.Flat()}), "initial law of 'v' is Flat", "Flat()",
+        (see, lambda: {"p": D.Dirac(0.0), "v": D.Flat()}), "initial distribution of 'v' is Flat",
+        "Flat()",
     ),
     "gamma start": (
-        (see, lambda: {"p": D.Dirac(0.0), "v": D.Gamma(2, rate=1)}), "the law of v is Gamma",
-        "D.Gamma(2",
+        (see, lambda: {"p": D.Dirac(0.0), "v": D.Gamma(2, rate=1)}),
+        "the distribution of v is Gamma", "D.Gamma(2",
     ),
     "gamma transition": (
         (see, None, lambda p, v: {"p": D.Dirac(p + v), "v": D.Gamma(2 + v, rate=1)}),
-        "the law of v is Gamma, not one of a Gaussian noise", "D.Gamma(2 + v",
+        "the distribution of v is Gamma, not driven by Gaussian noise", "D.Gamma(2 + v",
     ),
     "truncated": (
         (see, None,
          lambda p, v: {"p": D.Dirac(p + v), "v": D.Truncated(D.Normal(v, sd=1), lower=0)}),
-        "the law of v is Truncated", "D.Truncated(",
+        "the distribution of v is Truncated", "D.Truncated(",
     ),
     "no noise": (
         (see, None, lambda p, v: {"p": D.Dirac(p + v), "v": D.Dirac(0.9 * v)}),

@@ -149,7 +149,7 @@ def with_function(function, **options):
         (lambda v, strength: v.missing, {}, "missing"),
         (lambda v, w, strength: w, {"kind": "state", "states": ("w",)}, "Auxiliary"),
         (lambda v, w, strength: Auxiliary(0.0, {}, {}), {"kind": "state", "states": ("w",)},
-         "transition laws are"),
+         "transition distributions are"),
     ],
 )  # fmt: skip
 def test_faults_of_a_function_are_named_with_their_place(function, options, message):
@@ -164,7 +164,7 @@ def test_an_auxiliary_state_starts_from_what_an_initial_law_may_know():
         return Auxiliary(strength * w, {"w": law}, {"w": ssm.Dirac(v)})
 
     (c,), _ = with_function(lagged, kind="state", states=("w",))
-    with pytest.raises(ModelError, match="initial law of 'w_v' depends on 'v'"):
+    with pytest.raises(ModelError, match="initial distribution of 'w_v' depends on 'v'"):
         augment(traced("gap", "oscillator"), [c])
 
 

@@ -334,7 +334,7 @@ def test_what_does_not_fit_is_refused():
         augment(t, [c, c])
     with pytest.raises(ArgumentError, match="has no 'speed'"):
         augment(t, [replace(c, equation="speed")])
-    with pytest.raises(ArgumentError, match="cannot be added: its law is"):
+    with pytest.raises(ArgumentError, match="cannot be added: its distribution is"):
         augment(traced("features", "simplex"), [replace(c, equation="p[0]")])
 
 

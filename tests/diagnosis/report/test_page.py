@@ -97,8 +97,8 @@ def test_the_answer_comes_first_then_how_sure_then_what_next_and_the_model_last(
     found = [text for _, text in Reader(page("effect_found")).all("h2")]
     assert found == [
         "Where is the gap?", "Which effect is missing?", "How far does the gap close?",
-        "How sure", "What to do next", "The evidence", "Tables", "Words used here",
-        "The augmented model",
+        "How sure", "Next steps", "The evidence", "Tables", "Glossary",
+        "Augmented model",
     ]  # fmt: skip
     paragraphs = [text for _, text in Reader(page("effect_found")).all("p")]
     assert paragraphs[0].startswith("The model “oscillator” lacks one of these")

@@ -228,7 +228,7 @@ def test_what_would_tell_rivals_apart_is_named():
     assert "None of the simple inputs" in " ".join(next_steps(unknown))
     assert "full mode" in " ".join(next_steps(fast()))
     stopped = dataclasses.replace(effect_found(), interrupted=True)
-    assert "goes on from the stages done" in next_steps(stopped)[0]
+    assert "resumes from the completed stages" in next_steps(stopped)[0]
 
 
 def test_what_does_not_apply_is_told_with_its_reason():

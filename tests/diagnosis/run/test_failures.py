@@ -53,10 +53,10 @@ def broken(patch, module, name, error, when=lambda *args: True):
 # -- what is kept of an error
 @pytest.mark.parametrize(
     ("error", "text"),
-    [(KeyError("stribeck_v"), "KeyError: 'stribeck_v' (a fault of ssmppl)"),
-     (AssertionError(), "AssertionError (a fault of ssmppl)"),
+    [(KeyError("stribeck_v"), "KeyError: 'stribeck_v' (internal error in ssmppl)"),
+     (AssertionError(), "AssertionError (internal error in ssmppl)"),
      (SSMError("the likelihood is zero", fix="start elsewhere"), "the likelihood is zero"),
-     (ValueError("one\ntwo"), "ValueError: one (a fault of ssmppl)")],
+     (ValueError("one\ntwo"), "ValueError: one (internal error in ssmppl)")],
 )  # fmt: skip
 def test_a_reason_is_one_line(error, text):
     assert reason_of(error) == text
@@ -87,7 +87,7 @@ def test_a_task_that_fails_is_not_kept(tmp_path):
     assert [float(found[k]["half"]) for k in (0, 2)] == [0.0, 1.0]
     assert kept.failures.record_task("the half of 1", found[1])
     assert list(kept.failures) == [
-        ("the half of 1", "ZeroDivisionError: by nothing (a fault of ssmppl)")
+        ("the half of 1", "ZeroDivisionError: by nothing (internal error in ssmppl)")
     ]
     again = Checkpoint(tmp_path / "stages.npz", {"mode": "full"})
     assert "halves/0" in again
@@ -130,7 +130,9 @@ def test_a_table_or_stage_that_fails_is_left_out(monkeypatch, module, name, part
     broken(monkeypatch, module, name, KeyError("stribeck_v"))
     report = run(progress=part.startswith("the time"))
     assert report.left_out["part"].tolist() == [part]
-    assert report.left_out["reason"].tolist() == ["KeyError: 'stribeck_v' (a fault of ssmppl)"]
+    assert report.left_out["reason"].tolist() == [
+        "KeyError: 'stribeck_v' (internal error in ssmppl)"
+    ]
     assert report.verdict in VERDICTS
     assert f"- {part[0].upper()}{part[1:]}: KeyError" in str(report)
 
@@ -216,7 +218,7 @@ def test_a_panel_that_fails_is_left_out(monkeypatch, tmp_path):
     assert report.left_out["part"].tolist() == ["the panel 'ranked_effects'"]
     assert not (tmp_path / "ranked_effects.png").exists()
     assert (tmp_path / "free_run.png").exists()
-    assert "Failed parts" in page.read_text()
+    assert "Failed computations" in page.read_text()
     assert "ranked_effects" in (tmp_path / "left_out.csv").read_text()
 
 

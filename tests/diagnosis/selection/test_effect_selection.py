@@ -262,7 +262,7 @@ def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left)
     assert len(out.notes) == 3 - left
     assert out.left_out is (left < 3)
     if out.notes:
-        assert out.notes[-1].endswith(f"kept instead: {' and '.join(['effect'] * left)}")
+        assert out.notes[-1].endswith(f"retained: {' and '.join(['effect'] * left)}")
 
 
 @pytest.mark.parametrize(

@@ -162,9 +162,12 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     first = int(np.flatnonzero(parts.held_out[1])[0]) + 1
     assert report.parts == {"screen": (1, 84), "confirm": (first, 120)}
     assert first == 84 + GAP + 1
-    assert f"t = {first} to 120 of experiment 2, and likewise of the others" in how_far(report)[0]
+    assert (
+        f"t = {first} to 120 of experiment 2 and the corresponding rows of the other experiments"
+        in how_far(report)[0]
+    )
     assert "t = 1 to 84 of experiment 2" in how_sure(report)[0]
-    disjoint = "Likewise of the other experiments. Selection and evaluation rows are disjoint."
+    disjoint = "other experiments were used likewise. Selection and evaluation rows are disjoint."
     assert disjoint in how_sure(report)[0]
     results.selection.left_out = True
     report = build_report(dataclasses.replace(results, held_out=far), 1.0)

@@ -242,7 +242,10 @@ def test_gradient_by_differences_of_the_compiled_filter(linear):
     ("call", "words"),
     [
         (lambda m: ssm.sample(m, DATA, ssm.Gibbs(), progress=False), "Gibbs draws the states"),
-        (lambda m: ssm.maximize(m, DATA, ssm.EM(), progress=False), "EM needs the exact law"),
+        (
+            lambda m: ssm.maximize(m, DATA, ssm.EM(), progress=False),
+            "EM needs the exact distribution",
+        ),
     ],
 )
 def test_what_needs_exact_laws_is_refused(linear, call, words):

@@ -358,7 +358,7 @@ def test_what_is_eliminated():
         assert described(problem, setting, {}, "bootstrap") == "tau (Gamma)"
     assert described(problem, False, {}, "bootstrap") == "none: eliminate=False"
     held = described(problem, "auto", {"tau": np.array(2.0)}, "bootstrap")
-    assert held.startswith("none: the initial law of x is not conjugate")
+    assert held.startswith("none: the initial distribution of x is not conjugate")
     better = described(problem, "auto", {}, "auxiliary")
     assert better == "none: particles move by the proposal 'auxiliary'"
 
@@ -424,4 +424,4 @@ def test_plan_says_what_can_be_eliminated_and_why_not():
     plan = str(ssm.explain(models.scale))
     rows = plan[plan.index("Parameters that PGAS can marginalise") :]
     assert "tau  marginalised in the trajectory update" in rows
-    assert "phi  not marginalised: the initial law of x" in rows
+    assert "phi  not marginalised: the initial distribution of x" in rows

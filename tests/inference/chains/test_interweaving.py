@@ -504,7 +504,7 @@ def test_plan_says_who_moves_and_why():
     assert "Joint parameter-trajectory moves (ASIS interweaving)" in plan
     flat = " ".join(plan.split())
     assert "a, s, c: if warmup autocorrelation is high" in flat
-    assert "centred as before: z, k" in flat
+    assert "others stay centred: z, k" in flat
     exact = " ".join(str(ssm.explain(models.linear)).split())
     assert "phi, q, r: moved with the states integrated out" in exact
     assert "finitely many values" in str(ssm.explain(coin))

@@ -216,7 +216,7 @@ def test_particles_and_simulation_refuse_it():
         lambda: ssm.maximize(model, DATA, method=ssm.ParticleEM()),
         lambda: ssm.maximize(model, DATA, method=ssm.ScoreAscent()),
     ):
-        with pytest.raises(ArgumentError, match="initial law of 'level' is Flat"):
+        with pytest.raises(ArgumentError, match="initial distribution of 'level' is Flat"):
             call()
     with pytest.raises(ModelError, match="'level' is Flat, and cannot be drawn"):
         ssm.simulate(model, AT, steps=5)

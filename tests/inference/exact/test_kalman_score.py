@@ -190,7 +190,7 @@ def test_what_has_no_derivative_is_named():
     theta = np.array([0.3, 0.4])
     found = kalman_model(traced)
     with pytest.raises(
-        ArgumentError, match=r"score in a .*transition law: gammainc\(a, 1\)"
+        ArgumentError, match=r"score in a .*transition distribution: gammainc\(a, 1\)"
     ) as raised:
         found.score(experiments, theta)
     assert "x + special.gammainc(a, 1.0)" in str(raised.value)  # the line itself

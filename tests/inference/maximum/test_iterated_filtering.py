@@ -425,7 +425,7 @@ def test_no_top_is_told_where_there_is_none():
     assert "monte_carlo_errors" not in found.attrs
     assert np.all(np.isnan(list(found.standard_errors.values())))
     assert found.attrs["converged"] is False
-    assert any("has no top within reach" in note for note in found.notes)
+    assert any("has no maximum within" in note for note in found.notes)
 
 
 def test_too_much_noise_for_a_top_is_told():
@@ -433,7 +433,9 @@ def test_too_much_noise_for_a_top_is_told():
     method = ssm.IF2(particles=2, iterations=2, starts=1, averaged=2)
     found = ssm.maximize(OPAQUE, data, method, start=WALK, seed=1, progress=False)
     assert "monte_carlo_errors" not in found.attrs
-    assert any("too much noise" in note and "more particles" in note for note in found.notes)
+    assert any(
+        "Monte Carlo error too large" in note and "more particles" in note for note in found.notes
+    )
 
 
 def test_a_row_that_no_particle_can_produce_is_counted():

@@ -189,7 +189,7 @@ def test_the_maximum_is_that_of_the_recursion(tank, garch):
     sets = [tank_rows(60, 4)]
     found = ssm.maximize(tank, sets, seed=1, progress=False)
     assert found.attrs["method"] == "DirectOptimization"
-    assert found.attrs["likelihood"] == "exact, by running the states once"
+    assert found.attrs["likelihood"] == "exact, by one deterministic simulation"
     best = optimize.minimize(
         lambda v: -tank_log_likelihood(sets, v[0], v[1], np.exp(v[2])), [0.3, 1.2, -2.4],
         method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12, "maxiter": 10_000},

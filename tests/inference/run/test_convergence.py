@@ -61,7 +61,7 @@ def test_the_worst_is_named():
     assert "other" not in text.split(". ")[0]
     assert "400 of each chain" in text
     assert "warmup (500)" in text
-    assert "one other parameter is like it" in warned(np.stack([bad, good, bad], axis=2))
+    assert "1 other parameter also fails" in warned(np.stack([bad, good, bad], axis=2))
 
 
 def test_too_few_independent_draws():
@@ -69,7 +69,7 @@ def test_too_few_independent_draws():
     slow = chains(0.95, 1000, seed=5)
     assert rank_r_hat(slow) < 1.05
     assert bulk_ess(slow) < 100.0
-    assert warned(slow[:, :, None]).startswith("the chains hold too few independent draws")
+    assert warned(slow[:, :, None]).startswith("effective sample size too small")
 
 
 def test_when_there_is_no_warning():
@@ -102,7 +102,7 @@ def test_sample_warns_and_keeps_the_warning():
     model.observation(lambda x, a, b: {"y": ssm.Normal(x + a + b, sd=1)})
     data = {"y": np.random.default_rng(1).standard_normal(30)}
     settings = {"seed": 1, "progress": False, "states": False}
-    with pytest.warns(UserWarning, match="mixed|too few independent"):
+    with pytest.warns(UserWarning, match="mixed|sample size too small"):
         idata = ssm.sample(
             model,
             data,

@@ -157,6 +157,8 @@ def test_too_few_draws_for_a_law():
     """Ten draws of four numbers gave an evidence that was off by 45, with an error of 0.2."""
     data = {"y": load("lgss_main_text")["y"]}
     for draws, chains, least in ((19, 1, 20), (9, 2, 10)):
-        with pytest.raises(ssm.ArgumentError, match="too few to fit a law of 1 number") as found:
+        with pytest.raises(
+            ssm.ArgumentError, match="too few to fit a distribution of 1 number"
+        ) as found:
             ssm.evidence(models.lgss, data, fixed={"c": 0.5}, draws=draws, chains=chains)
         assert f"at least {least} draws" in found.value.fix

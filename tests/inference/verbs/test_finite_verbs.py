@@ -41,7 +41,7 @@ def test_likelihoods_are_exact(data):
     level.initial(lambda: {"x": ssm.Normal(0, sd=1)})
     level.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
     level.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
-    with pytest.raises(ArgumentError, match=r"model of finite states: .*continuum"):
+    with pytest.raises(ArgumentError, match=r"finite-state .hidden Markov. model: .*continuum"):
         ssm.log_likelihood(level, data, {}, proposal="forward")
     with pytest.raises(ArgumentError, match="ForwardBackward needs states of finitely many"):
         ssm.smooth(level, data, {}, ssm.ForwardBackward())
@@ -247,7 +247,7 @@ def test_evidence_without_parameters_is_exact(data):
 def test_explain_says_so():
     text = str(ssm.explain(second_order()))
     assert "4 combinations of values: the likelihood is exact, by the forward algorithm" in text
-    assert "ForwardBackward: the model is of finitely many states" in " ".join(text.split())
+    assert "ForwardBackward: the model is finite-state (hidden Markov)" in " ".join(text.split())
 
 
 def regimes(matrix):

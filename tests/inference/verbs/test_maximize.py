@@ -239,7 +239,7 @@ def test_a_likelihood_without_a_maximum_is_not_called_converged():
 @pytest.mark.parametrize(
     ("arguments", "found"),
     [
-        ({"method": ssm.PGAS()}, "no method of maximisation"),
+        ({"method": ssm.PGAS()}, "not a maximisation method"),
         ({"objective": "evidence"}, "objective='evidence'"),
         ({"start": {"theta": -1.0}}, "start: parameter 'theta'"),
         ({"start": {"nothing": 1.0}}, "start names 'nothing'"),

@@ -155,7 +155,7 @@ def test_nonlinear_model_chooses_particles_and_says_why():
 # -- refusals
 @pytest.mark.parametrize(("args", "more", "words"), [
     (("ffbsy",), {}, ["method='ffbsy' is unknown", "ffbsi"]),
-    ((ssm.PMMH(),), {}, ["no method of smoothing", "ssm.FFBSi(...)"]),
+    ((ssm.PMMH(),), {}, ["not a smoothing method", "ssm.FFBSi(...)"]),
     ((ssm.KalmanSmoother(),), {"particles": 10}, ["KalmanSmoother works without", "ssm.FFBSi()"]),
     (("fixed_lag",), {"trajectories": 5}, ["marginals only", "ssm.FFBSi()"]),
     ((ssm.FixedLag(-1),), {}, ["lag=-1"]),

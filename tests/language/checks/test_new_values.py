@@ -143,10 +143,10 @@ REFUSED = {
     "before": ((flow_of, x_by_flow, v_by_flow_before), {}, "has no value before",
                "ask for 'flow_next'"),
     "unused": ((flow_of, give_x, lambda v: {"v": ssm.Normal(v, sd=1)}), {},
-               "'flow', which has no initial law", "read as 'flow_next' by a later"),
+               "'flow', which has no initial distribution", "read as 'flow_next' by a later"),
     "observed": ((flow_of, x_by_flow), {"initial": ("x",),
                   "observed": lambda flow: {"y": ssm.Poisson(flow)}},
-                 "no value at the first row", "give 'flow' an initial law"),
+                 "no value at the first row", "give 'flow' an initial distribution"),
     "observation": ((give_x, give_v), {"observed": lambda x_next: {"y": ssm.Normal(x_next, sd=1)}},
                     "'x_next' is the new value of 'x' in a step", "name 'x'"),
     "prior": ((give_x, give_v), {"prior": lambda x_next: {"a": ssm.Normal(x_next, sd=1)}},
@@ -203,4 +203,4 @@ def test_what_another_law_kept_is_refused_all_the_same():
     def borrow(v):
         return {"v": ssm.Normal(v + kept[0], sd=1)}
 
-    assert "a symbol of another law" in refusal(give, borrow, observed=observed).found
+    assert "a symbol of another distribution" in refusal(give, borrow, observed=observed).found

@@ -385,7 +385,7 @@ def test_the_formula_by_itself_has_no_number_there():
 
 REFUSED = {
     "one component": (lambda: D.Mixture([1.0], [D.Normal(0, sd=1)]), "at least two"),
-    "no laws": (lambda: D.Mixture([0.5, 0.5], [1.0, 2.0]), "components are"),
+    "no distributions": (lambda: D.Mixture([0.5, 0.5], [1.0, 2.0]), "components are"),
     "weights": (lambda: D.Mixture([0.2, 0.3, 0.5], [D.Normal(0, sd=1), D.Normal(1, sd=1)]),
                 "one weight for each component"),
     "sum": (lambda: D.Mixture([0.5, 0.6], [D.Normal(0, sd=1), D.Normal(1, sd=1)]),
@@ -405,9 +405,13 @@ REFUSED = {
     "an angle": (lambda: D.Truncated(D.VonMises(0, concentration=1), lower=0), "VonMises"),
     "quantile": (lambda: D.Mixture([0.5, 0.5], [D.Normal(0, sd=1)] * 2).quantile(0.5),
                  "no formula"),
-    "no counts": (lambda: D.ZeroInflated(D.Normal(0, sd=1), 0.5), "no law of counts"),
-    "labels inflated": (lambda: D.ZeroInflated(D.Categorical([0.5, 0.5]), 0.5), "no law of counts"),
-    "twice": (lambda: D.ZeroInflated(D.ZeroInflated(D.Poisson(1), 0.5), 0.5), "no law of counts"),
+    "no counts": (lambda: D.ZeroInflated(D.Normal(0, sd=1), 0.5), "no distribution of counts"),
+    "labels inflated": (
+        lambda: D.ZeroInflated(D.Categorical([0.5, 0.5]), 0.5), "no distribution of counts"
+    ),
+    "twice": (
+        lambda: D.ZeroInflated(D.ZeroInflated(D.Poisson(1), 0.5), 0.5), "no distribution of counts"
+    ),
     "share": (lambda: D.ZeroInflated(D.Poisson(1), 1.5), "p = 1.5 is outside"),
     "trials": (lambda: D.BetaBinomial(2.5, 1, 1), "n = 2.5 is no whole number"),
 }  # fmt: skip

@@ -84,7 +84,7 @@ def test_the_time_step_may_be_given_and_dates_have_a_unit(record):
     plan = ssm.explain(model, pd.DataFrame({"y": y}, index=dates))
     text, parts = str(plan), dict(plan.sections())
     assert ("steps", "dt is the time from each row to the next, in min") in parts["Data"]
-    assert all(what == "the exponential of a matrix" for _, what in parts["Small steps"])
+    assert all(what == "the exponential of a matrix" for _, what in parts["Numerical integration"])
     assert "approximated" not in text
 
 
@@ -186,12 +186,15 @@ def test_a_nonlinear_sde_is_near_its_law_over_a_short_time():
 def test_results_say_that_the_law_of_a_nonlinear_sde_is_approximate(record):
     model = van_der_pol("linearised", 4)
     drawn = ssm.simulate(model, {}, steps=5, seed=1)
-    assert "x: the law of an SDE, approximated by its lin" in drawn.attrs["approximate_laws"]
+    assert (
+        "x: the distribution of an SDE, approximated by its lin"
+        in drawn.attrs["approximate_distributions"]
+    )
     filtered = ssm.particle_filter(model, {"y": drawn["y"].values[0]}, {}, particles=20, seed=1)
-    assert filtered.attrs["approximate_laws"] == drawn.attrs["approximate_laws"]
+    assert filtered.attrs["approximate_distributions"] == drawn.attrs["approximate_distributions"]
     time, y = record
     exact = ssm.kalman_filter(oscillator(), {"y": y, "time": time}, {"k": 4.0, "d": 0.6})
-    assert "approximate_laws" not in exact.attrs
+    assert "approximate_distributions" not in exact.attrs
 
 
 def test_loops_are_told_by_name():
@@ -217,7 +220,7 @@ def test_loops_are_told_by_name():
         return {"y": ssm.Normal(x + w, sd=1)}
 
     parts = dict(ssm.explain(model).sections())
-    told, laws = dict(parts["Small steps"]), str(parts["Transition, x_prev to x"])
+    told, laws = dict(parts["Numerical integration"]), str(parts["Transition, x_prev to x"])
     assert list(told.values()) == [
         "decay_midpoint, repeated 7 times",
         "fold, repeated n_prev times",

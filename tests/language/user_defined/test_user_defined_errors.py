@@ -34,7 +34,7 @@ def used(law):
 
 
 # -- declarations
-@bad("stands on 3, which is no function", "on the line above a def")
+@bad("decorates 3, which is not a function", "on the line above a def")
 def declared_on_a_number():
     ssm.distribution(3)  # HERE
 
@@ -95,7 +95,7 @@ def sampler_with_parentheses():
         return rng.normal()
 
 
-@bad("@Gumbel.mean stands on 2.0", "make one first by giving its arguments")
+@bad("@Gumbel.mean decorates 2.0", "make one first by giving its arguments")
 def a_mean_of_the_declaration():
     Gumbel.mean(2.0)  # HERE
 
