@@ -197,7 +197,10 @@ class Refusal:
             return None
         if all(name not in self.names_given(f) for f in self.functions):
             return None
-        found = f"{name!r} is drawn within a step and has no initial distribution, hence no value "
+        found = (
+            f"{name!r} is drawn within a step and has no initial distribution, so that it has no "
+            "value "
+        )
         if role == "transition":
             return (
                 found + "before",

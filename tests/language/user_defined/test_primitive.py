@@ -100,7 +100,7 @@ def test_bad_primitives():
             return open(v)
 
     assert __file__ in str(error.value)
-    with pytest.raises(ssm.ModelError, match="no function"):
+    with pytest.raises(ssm.ModelError, match="not a function"):
         ssm.primitive(3.0)
     with pytest.raises(ssm.ModelError, match="returns"):
 
