@@ -24,7 +24,7 @@ from table import machine, show
 
 import ssmppl as ssm
 from ssmppl.codegen.kernels.math.random import new_state
-from ssmppl.inference.chains.pgas import Sweeper, pgas_block, plan_updates, start_chain
+from ssmppl.inference.chains.pgas import SweepSetup, pgas_block, plan_updates, start_chain
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
 from ssmppl.inference.run.problem import Problem, pose
 
@@ -69,12 +69,12 @@ def filter_run(problem: Problem, particles: int) -> Callable[[], object]:
 
 def sweep_run(problem: Problem, particles: int) -> Callable[[], object]:
     theta = np.zeros(len(problem.trace.parameter_symbols))
-    sweeper = Sweeper(problem, plan_updates(problem, {}), FilterSettings(particles, "bootstrap"))
+    setup = SweepSetup(problem, plan_updates(problem, {}), FilterSettings(particles, "bootstrap"))
     stream, generator = new_state(np.random.SeedSequence(1)), np.random.default_rng(1)
-    states = [start_chain(sweeper, theta, generator, stream)]
+    states = [start_chain(setup, theta, generator, stream)]
 
     def sweep() -> None:
-        states[0] = pgas_block(sweeper, 1, False, states[0], 1)[0]
+        states[0] = pgas_block(setup, 1, False, states[0], 1)[0]
 
     return sweep
 

@@ -6,7 +6,7 @@ code  when
 0     all is done
 1     a fault of the model, of the data or of a value; or of this package, with a traceback
 2     the command line is not one: an unknown option, a file that is not there
-3     answered in part: what failed is named in the answer and on standard error
+3     incomplete result: what failed is named in the result and on standard error
 130   interrupted by Ctrl-C; what was kept is said on standard error
 ====  ==============================================================================
 

@@ -237,13 +237,15 @@ def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
     if node.op == "call":
         return _chain_of_call(node, 0, tangent)
     if node.op not in PARTIALS:
-        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
+        raise NotDifferentiable(f"{_short_text(node)} has no derivative in closed form")
     total = _NONE
     partials = PARTIALS[node.op](node, *node.args)
     for place, (argument, partial) in enumerate(zip(node.args, partials, strict=True)):
         if argument in tangent and not _is_zero(tangent[argument].value):
             if partial is None:
-                raise NotDifferentiable(f"{_told(node)} has no derivative in {_told(argument)}")
+                raise NotDifferentiable(
+                    f"{_short_text(node)} has no derivative in {_short_text(argument)}"
+                )
             total = total.plus(_summand(node, place, partial, tangent))
     return total
 
@@ -262,12 +264,12 @@ def _partial_of_call(node: Expr, place: int, output: int) -> Expr:
     """The derivative of an opaque function in one argument: a call of another one."""
     slope = getattr(node.data, "slope", None)
     if slope is None:
-        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
+        raise NotDifferentiable(f"{_short_text(node)} has no derivative in closed form")
     found: Expr = slope(node.args, place, output)
     return found
 
 
-def _told(node: Expr) -> str:
+def _short_text(node: Expr) -> str:
     """The expression in a message, of which nobody reads more than a line."""
     text = repr(node)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
@@ -504,13 +506,15 @@ def _of_arguments(node: Expr, slope: _Slope, involved: set[Expr]) -> list[tuple[
         slopes = [_Slope(slope.value * p, slope.moves) for p in partials]
         return list(zip(moving, slopes, strict=True))
     if node.op not in PARTIALS:
-        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
+        raise NotDifferentiable(f"{_short_text(node)} has no derivative in closed form")
     out = []
     for argument, partial in zip(node.args, PARTIALS[node.op](node, *node.args), strict=True):
         if argument not in involved:
             continue
         if partial is None:
-            raise NotDifferentiable(f"{_told(node)} has no derivative in {_told(argument)}")
+            raise NotDifferentiable(
+                f"{_short_text(node)} has no derivative in {_short_text(argument)}"
+            )
         out.append((argument, _Slope(slope.value * as_expr(partial), slope.moves)))
     return out
 

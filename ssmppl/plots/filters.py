@@ -211,7 +211,7 @@ def plot_ancestry(
     for name, panel in zip(states, axes, strict=True):
         _tree(panel, one["time"].values, values[name], ancestors)
         panel.set_ylabel(name)
-    axes[0].set_title(_told(one["time"].values, alive))
+    axes[0].set_title(_ancestry_title(one["time"].values, alive))
     only_below(axes)
     key(axes, ax)
     return handed(axes)
@@ -240,7 +240,7 @@ def survivors(ancestors: np.ndarray, every: int = 1) -> np.ndarray:
     return alive
 
 
-def _told(time: np.ndarray, alive: np.ndarray) -> str:
+def _ancestry_title(time: np.ndarray, alive: np.ndarray) -> str:
     """How many particles, and since when they have one ancestor in common."""
     n = alive.shape[1]
     common = np.flatnonzero(alive.sum(axis=1) == 1)

@@ -198,9 +198,9 @@ def old_trajectory(original):
 
 
 def noting_the_old(original):
-    def trajectories(sweeper, theta, paths, stream):
+    def trajectories(sweep, theta, paths, stream):
         _before[:] = [[p.copy() for p in paths]]
-        return original(sweeper, theta, paths, stream)
+        return original(sweep, theta, paths, stream)
 
     return trajectories
 
@@ -224,7 +224,7 @@ MUTANTS = {
                ((gibbs, "draw_parameters", others_old),)),
         Mutant("given the trajectory of before", "leverage PGAS",
                ((pgas, "draw_parameters", old_trajectory),
-                (pgas, "_trajectories", noting_the_old))),
+                (pgas, "run_conditional_smc", noting_the_old))),
         Mutant("no Jacobian of the scale", "stationary MetropolisHastings",
                ((Space, "parameters", no_jacobian),)),
         Mutant("no Jacobian of the scale, PMMH", "ricker PMMH",

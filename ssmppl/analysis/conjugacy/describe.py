@@ -81,9 +81,9 @@ def statistics(form: BlockForm) -> tuple[str, ...]:
         for i, function in enumerate(form.functions[:MAX_STATISTICS])
     ]
     if lines:
-        lines.insert(0, "sufficient statistics C[.]:")
+        lines = ["sufficient statistics C[.]:", *("  " + line for line in lines)]
     hidden = len(form.functions) - MAX_STATISTICS
-    return tuple(lines) + ((f"... and {hidden} more",) if hidden > 0 else ())
+    return tuple(lines) + ((f"  ... and {hidden} more",) if hidden > 0 else ())
 
 
 def _sum(parts: list[str]) -> str:

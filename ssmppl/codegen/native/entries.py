@@ -158,8 +158,8 @@ def entry(
     )  # fmt: skip
     predicted = aside.algorithm.section.roles if aside else None
     run, own, beside = by_address(algorithm.function, section.roles, helpers, fixed, predicted)
-    codes = np.zeros(len(own) + len(beside), dtype=np.int64)
-    codes[: len(own)] = [places.get(r, 0) for r in own]
+    addresses = np.zeros(len(own) + len(beside), dtype=np.int64)
+    addresses[: len(own)] = [places.get(r, 0) for r in own]
     values: dict[str, Any] = {"sizes": algorithm.sizes}
     for n in NUMBERS:
         if n in bound and n not in of_helpers and n not in dict(fixed):
@@ -168,26 +168,26 @@ def entry(
             values[n] = vars(particle_filter)[text] if constant else literal(text)
     constants = [values[p] for p in parameters if p in values]
     if not aside:
-        return ByAddress(run, tuple(constants), codes)
+        return ByAddress(run, tuple(constants), addresses)
     taken = {*own, *dict(fixed), *values, "predict", "theta"}
     at = [p for p in parameters if p not in taken].index("moments")
-    return Predicting(run, tuple(constants), codes, aside, at, beside)
+    return Predicting(run, tuple(constants), addresses, aside, at, beside)
 
 
 class ByAddress:
     """A compiled algorithm for one model: called with theta and all that follows.
 
-    run : the algorithm. constants : what it takes before theta. codes : the addresses.
+    run : the algorithm. constants : what it takes before theta. addresses : of the model's functions.
     """
 
     def __init__(
-        self, run: Callable[..., Any], constants: tuple[Any, ...], codes: np.ndarray,
+        self, run: Callable[..., Any], constants: tuple[Any, ...], addresses: np.ndarray,
         further: tuple[Any, ...] = (),
     ):  # fmt: skip
-        self.run, self.constants, self.codes, self.further = run, constants, codes, further
+        self.run, self.constants, self.addresses, self.further = run, constants, addresses, further
 
     def __call__(self, theta: np.ndarray, *rest: Any) -> Any:
-        found = self.run(*self.constants, (self.codes, theta, *self.further), *rest)
+        found = self.run(*self.constants, (self.addresses, theta, *self.further), *rest)
         if PENDING:
             raise_pending()
         return found
@@ -200,10 +200,10 @@ class Predicting(ByAddress):
     """
 
     def __init__(
-        self, run: Callable[..., Any], constants: tuple[Any, ...], codes: np.ndarray, aside: Aside,
-        at: int, beside: tuple[str, ...],
+        self, run: Callable[..., Any], constants: tuple[Any, ...], addresses: np.ndarray,
+        aside: Aside, at: int, beside: tuple[str, ...],
     ):  # fmt: skip
-        super().__init__(run, constants, codes, (aside.algorithm.sizes,))
+        super().__init__(run, constants, addresses, (aside.algorithm.sizes,))
         self.aside, self.at, self.beside, self.waiting = aside, at, beside, True
 
     def __call__(self, theta: np.ndarray, *rest: Any) -> Any:
@@ -212,18 +212,20 @@ class Predicting(ByAddress):
                 found = self.aside.places()
             except Untranslatable:
                 return self.aside.instead(theta, *rest)
-            self.codes[len(self.codes) - len(self.beside) :] = [found[r] for r in self.beside]
+            self.addresses[len(self.addresses) - len(self.beside) :] = [
+                found[r] for r in self.beside
+            ]
             self.waiting = False
         return super().__call__(theta, *rest)
 
 
-def for_each(kernel: Callable[..., Any], algorithm: Callable[..., Any]) -> Callable[..., Any]:
-    """A kernel of `kernels/panels/each.py` with an algorithm of one model for its `run`:
+def over_data_sets(kernel: Callable[..., Any], algorithm: Callable[..., Any]) -> Callable[..., Any]:
+    """A kernel of `kernels/data_sets/each.py` with an algorithm of one model for its `run`:
     called with theta and all that follows. Where the algorithm has no addresses, the loop over
     data sets is Python's."""
     if isinstance(algorithm, ByAddress):
         over = _over(kernel, algorithm.run)
-        return ByAddress(over, (algorithm.constants,), algorithm.codes, algorithm.further)
+        return ByAddress(over, (algorithm.constants,), algorithm.addresses, algorithm.further)
     plain: Callable[..., Any] = getattr(kernel, "py_func", kernel)
     return partial(plain, algorithm, ())
 

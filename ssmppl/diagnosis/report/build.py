@@ -42,7 +42,9 @@ def build_report(r: Results, seconds: float) -> GapReport:
     order, found = table("classes", r.classes, ([], None))
     decision = decide(r, where, checks)
     missing = _curve(r, decision)
-    if decision.verdict == NO_GAP and not r.screened:  # they are of a fit that was not the best one
+    if (
+        decision.verdict == NO_GAP and not r.screen_is_current
+    ):  # they are of a fit that was not the best one
         where["p"], checks["p"] = np.nan, np.nan
     share, runs = tabulate("closed"), None
     if r.selection:
@@ -68,7 +70,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
     attributes: dict[str, str] = {}
     if found is not None:
         causes = table("causes", lambda: tables.causes_table(
-            screen, r.refits, found, order, r.tested, r.screened))  # fmt: skip
+            screen, r.refits, found, order, r.tested, r.screen_is_current))  # fmt: skip
         classes = table("classes", lambda: tables.classes_table(
             screen, found, order, r.separating))  # fmt: skip
         if len(causes) and (text or r.unfitted is not None):

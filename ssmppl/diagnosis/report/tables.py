@@ -128,17 +128,17 @@ def missing_table(
 
 def causes_table(
     screen: Screen, refits: Sequence[Refit], found: Classes, order: Sequence[int],
-    tested: Mapping[int, float] | None, screened: bool = True,
+    tested: Mapping[int, float] | None, screen_is_current: bool = True,
 ) -> pd.DataFrame:  # fmt: skip
     """One row for each group of candidates, the refitted ones first; pairs are not listed.
 
     tested : p of refits whose own gain was tested, by column; None where no refit was to be tested.
-    With two tests p is twice the smaller one (Bonferroni). screened : whether the screen's own p
-    holds; else what was not tested has none.
+    With two tests p is twice the smaller one (Bonferroni). screen_is_current : whether the
+    screen's own p holds; else what was not tested has none.
     """
     tests, tested = (1, {}) if tested is None else (2, tested)
     by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
-    significant = screen.significant
+    significant = screen.candidate_p
     rows = []
     for i, k in enumerate(order):
         c, s = screen.design.candidates[k], screen.efficient
@@ -156,7 +156,7 @@ def causes_table(
         else:
             estimate = _strength_row(screen, c, strength, error)
         p = tested.get(k, np.nan)
-        if screened:
+        if screen_is_current:
             p = min(float(significant[k]), tested.get(k, 1.0))
         rows.append({
             "effect": c.effect.name, "equation": c.equation, "z": float(s.z[k]),

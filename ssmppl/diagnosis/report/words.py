@@ -31,8 +31,10 @@ GLOSSARY = {
     "a likelihood ratio of 2.7, 3 nats one of 20, 10 nats one of 22,000",
     "reference model": "the model with the effects and with smooth functions of states and inputs "
     "where they help; its gain in held-out log predictive density over the original model is 100%",
-    "p": "the p-value corrected for multiple testing (family-wise): the probability, if the model "
-    "were right, that the largest of all statistics tested is at least this large",
+    "p": "the p-value corrected for multiple testing (family-wise): an upper bound on the "
+    "probability, if the model were right, that any effect tried is this significant; of places "
+    "and of tests of the predictions five times their own. So alpha bounds the chance that an "
+    "effect is named falsely, and about 1.4 alpha (fast mode: 1.6 alpha) that of any false finding",
     "z": "a standardised deviation from what the model expects",
     "±": "one standard error; twice that, either way, is about a 95% interval",
 }

@@ -260,7 +260,7 @@ class Screen:
         return len(self.simulated.nuisance)
 
     @property
-    def significant(self) -> np.ndarray:
+    def candidate_p(self) -> np.ndarray:
         """(K,) family-wise p of the group of each candidate."""
         return self.family.of_columns(self.groups)
 

@@ -30,7 +30,7 @@ from ssmppl.diagnosis.selection.refit import (
     pairs,
     refit_all,
 )
-from ssmppl.diagnosis.selection.refit_test import LAX, affordable, gain_p, refit_p
+from ssmppl.diagnosis.selection.refit_test import CLOSER_LOOK_FACTOR, affordable, gain_p, refit_p
 from ssmppl.diagnosis.selection.shapes import shaped_all
 from ssmppl.errors import SSMError
 
@@ -204,13 +204,13 @@ class EffectSelection:
         """Whether a refit gains more than chance: by bootstrap where that is affordable, else by
         the law of the scores, the same to first order (likelihood ratio and score tests)."""
         found = {r.index[0]: gain_p(self.screen, r) for r in out.refits}
-        if not found or min(found.values()) > LAX * alpha:
+        if not found or min(found.values()) > CLOSER_LOOK_FACTOR * alpha:
             return False
         if affordable(self.augmented, self.train):
             anew = one_signed_candidates(self.screen)  # fits to simulated data would take too long
             rest = {k: p for k, p in found.items() if k not in anew}
             found = {k: p for k, p in found.items() if k in anew}
-            if min(rest.values(), default=1.0) <= LAX * alpha:
+            if min(rest.values(), default=1.0) <= CLOSER_LOOK_FACTOR * alpha:
                 best = min(rest, key=lambda k: rest[k])
                 found[best] = refit_p(
                     self.augmented, out.base, self.screen, alpha,
@@ -253,7 +253,7 @@ class EffectSelection:
             except SSMError as error:
                 out.notes.append(f"the test for a further effect failed: {error.found}")
                 return
-            if float(np.min(again.family.p, initial=1.0)) > LAX * self.alpha:
+            if float(np.min(again.family.p, initial=1.0)) > CLOSER_LOOK_FACTOR * self.alpha:
                 return
             more, _ = self._refit(
                 chosen.fit, again, [[k] for k in leading(again)[:FOLLOWERS]],
@@ -296,7 +296,7 @@ def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | No
         done = {int(screen.groups[r.index[0]]) for r in refits}
         best = max((r.penalised_gain for r in refits), default=0.0)
         found = int(screen.groups[k]) not in done and screen.efficient.gain[k] > best
-        return k if found and float(screen.significant[k]) <= alpha else None
+        return k if found and float(screen.candidate_p[k]) <= alpha else None
     return None
 
 

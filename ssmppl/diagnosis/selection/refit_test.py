@@ -28,10 +28,11 @@ from ssmppl.diagnosis.selection.refit import Refit, start_at
 from ssmppl.errors import SSMError
 from ssmppl.inference.run.seeds import random_state
 
-LAX = 4.0  # times alpha, up to which a closer look is worth it
+CLOSER_LOOK_FACTOR = 4.0  # times alpha, up to which a closer look is worth it
 TRIED = 2  # candidates refitted in each set, the best by the score
 SETS, CHUNK = 99, 10
-ENOUGH, CLEAR = 30, 0.1  # sets from which their tail is believed, where p is such a share of alpha
+SETS_FOR_TAIL = 30  # sets from which their tail is believed
+TAIL_ALPHA_SHARE = 0.1  # of alpha, up to which p by that tail ends the test
 MOST_WORK = 1.5e5  # rows times particles, beyond which the fits would take too long
 MOST_ROWS = 300  # from which on the law of the scores is taken
 
@@ -74,10 +75,10 @@ def refit_p(
         beyond = int(np.sum(gains >= gain))
         if (beyond + 1.0) / (SETS + 1.0) > alpha:
             break
-        if beyond == 0 and done >= ENOUGH:
+        if beyond == 0 and done >= SETS_FOR_TAIL:
             heights = np.sqrt(2.0 * np.maximum(gains[np.isfinite(gains)], 0.0))
             p = tail_p(float(np.sqrt(2.0 * max(gain, 0.0))), heights)
-            if p <= CLEAR * alpha:
+            if p <= TAIL_ALPHA_SHARE * alpha:
                 return p
     return (beyond + 1.0) / (done + 1.0)
 

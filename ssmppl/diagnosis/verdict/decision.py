@@ -23,9 +23,9 @@ from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP, NONE_OF_THESE
 if TYPE_CHECKING:
     import pandas as pd
 
-CLEARLY = 2.0  # standard errors
-MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"
-LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows validate it
+SIGNIFICANT_GAIN_SE = 2.0  # standard errors of a gain beyond the catalogue that is no chance
+LEAST_SHARE_LEFT = 0.15  # of the gap, by the catalogue, before it is "none of these"
+RESIDUAL_ALPHA_SHARE = 0.2  # of alpha, for what the catalogue leaves where nothing is held out
 
 Place = tuple[str, str]  # equation and moment
 
@@ -56,7 +56,7 @@ def decide(r: Results, where: pd.DataFrame, checks: pd.DataFrame) -> Decision:
         elif unlike:
             found = Decision(EFFECT, strongest_mean(where))
     # Places and checks that are of a fit which was not the best one say nothing.
-    if found.verdict == NO_GAP and r.screened and stands_out(r.alpha, where, checks):
+    if found.verdict == NO_GAP and r.screen_is_current and stands_out(r.alpha, where, checks):
         found = Decision(NONE_OF_THESE, strongest_mean(where))
     return found
 
@@ -76,7 +76,7 @@ def _by_effects(r: Results, where: pd.DataFrame) -> Decision:
     if not refitted:  # nothing is held out: what all of the catalogue leaves
         tried = testable_candidates(r.screen)
         residual, place = strongest_residual(r.screen, tried)
-        if residual <= LEFT * r.alpha and place is not None:
+        if residual <= RESIDUAL_ALPHA_SHARE * r.alpha and place is not None:
             return _none_of_these(place, tried)
     return Decision(NO_GAP)
 
@@ -102,11 +102,11 @@ def curves_beat(far: HeldOutGain, chosen: bool) -> bool:
     than chance explains, and, where effects were chosen, by more than a trifle of the gap."""
     if (
         far.beyond_catalogue is None
-        or not far.beyond_catalogue.nats > CLEARLY * far.beyond_catalogue.error
+        or not far.beyond_catalogue.nats > SIGNIFICANT_GAIN_SE * far.beyond_catalogue.error
     ):
         return False
     share = float(far.rows[0]["F"]) if chosen and far.rows else np.nan
-    return not share > 1.0 - MATTERS
+    return not share > 1.0 - LEAST_SHARE_LEFT
 
 
 def testable_candidates(screen: Screen) -> list[Candidate]:

@@ -70,7 +70,7 @@ class Results:
         return self.selection.unfitted if self.selection else None
 
     @property
-    def screened(self) -> bool:
+    def screen_is_current(self) -> bool:
         """Whether the screen was run at the model's fit as it is known now."""
         return not (self.selection and self.selection.rebased)
 

@@ -52,7 +52,9 @@ class Loop:
         self.states = len(self.update)
         self._key = (name, fixed, *map(id, self.update))
         self.digest = hashlib.sha256(
-            repr([(op, places, _told(data)) for op, places, data in pack(self.update)]).encode()
+            repr(
+                [(op, places, _data_text(data)) for op, places, data in pack(self.update)]
+            ).encode()
         ).hexdigest()[:8]
 
     def __eq__(self, other: object) -> bool:
@@ -80,7 +82,7 @@ class Loop:
         return tuple(held(j) for j in range(self.fixed))
 
 
-def _told(data: Any) -> str:
+def _data_text(data: Any) -> str:
     return str(getattr(data, "name", data)) if not isinstance(data, Loop) else repr(data)
 
 

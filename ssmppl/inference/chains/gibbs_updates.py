@@ -16,9 +16,9 @@ from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import deterministic
-from ssmppl.codegen.kernels.panels.each import sums_of_each
+from ssmppl.codegen.kernels.data_sets.each import sums_of_each
 from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
-from ssmppl.codegen.native.entries import for_each
+from ssmppl.codegen.native.entries import over_data_sets
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
@@ -146,7 +146,7 @@ def _totals(steps: GibbsUpdates, k: int, theta: np.ndarray, paths: list[np.ndarr
     if update.needs_log_joint or not update.functions:
         return np.empty(0)
     each = np.empty((len(paths), len(update.functions)))
-    run = for_each(sums_of_each, getattr(steps.module, statistics_name(update)))
+    run = over_data_sets(sums_of_each, getattr(steps.module, statistics_name(update)))
     run(theta, *steps.problem.end_to_end.data, joined(paths), each)
     total = np.add.reduce(each)  # one after the other, as they stand
     prior = steps.prior_totals[k]
@@ -178,6 +178,6 @@ def log_joints(problem: Problem, theta: np.ndarray, rows: np.ndarray) -> np.ndar
     """(E,) log p(x, y | theta) of each data set, of trajectories end to end (R, D); deterministic
     components of x are set on the way."""
     each = np.empty((len(problem.experiments), 1))
-    run = for_each(sums_of_each, problem.program.entry("log_joint"))
+    run = over_data_sets(sums_of_each, problem.program.entry("log_joint"))
     run(theta, *problem.end_to_end.data, rows, each)
     return each[:, 0]

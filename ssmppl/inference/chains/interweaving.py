@@ -49,14 +49,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.analysis.proposals.noises import Noises, noises
-from ssmppl.codegen.kernels.panels.each import (
+from ssmppl.codegen.kernels.data_sets.each import (
     linearise_each,
     noise_of_each,
     path_of_each,
 )
 from ssmppl.codegen.modules.gaussian import GaussianApproximation, backward_passes_of_each
 from ssmppl.codegen.modules.interweaving import compile_noises
-from ssmppl.codegen.native.entries import for_each
+from ssmppl.codegen.native.entries import over_data_sets
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.data import unpack_parameters
@@ -153,7 +153,7 @@ class NoiseMove:
         guide = self._guide(theta)
         if guide is None:
             return -np.inf, held
-        run = for_each(noise_of_each, self.module.noise_of)
+        run = over_data_sets(noise_of_each, self.module.noise_of)
         run(theta, *every.data, *guide, rows, held, log_volume)
         return self._density(theta, rows, log_volume), held
 
@@ -162,7 +162,7 @@ class NoiseMove:
         if guide is None:
             return -np.inf, paths
         new, log_volume = np.empty_like(rows), np.empty(len(paths))
-        run = for_each(path_of_each, self.module.path_of)
+        run = over_data_sets(path_of_each, self.module.path_of)
         if not run(theta, *every.data, *guide, rows, held, new, log_volume):
             return -np.inf, paths
         return self._density(theta, new, log_volume), every.split(new)
@@ -191,7 +191,7 @@ class NoiseMove:
         derivatives = [np.zeros(s) for s in shapes]
         looking = not self.looks
         g, h = self.looks[0] if self.looks else (np.empty((rows, d)), np.empty((rows, d, d)))
-        linearise = for_each(linearise_each, self.module.linearise)
+        linearise = over_data_sets(linearise_each, self.module.linearise)
         if not linearise(theta, *every.data, x, looking, *derivatives, g, h):
             return None
         if looking and not self.data_told_by:

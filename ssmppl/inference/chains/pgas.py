@@ -14,9 +14,9 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory, singular_covariance
-from ssmppl.codegen.kernels.panels.each import conditional_smc_each
+from ssmppl.codegen.kernels.data_sets.each import conditional_smc_each
 from ssmppl.codegen.kernels.particle.weights import OK
-from ssmppl.codegen.native.entries import for_each
+from ssmppl.codegen.native.entries import over_data_sets
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.elimination import (
     Eliminating,
@@ -88,7 +88,7 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
         elimination = Eliminating(problem, eliminated.updates, settings.particles, adapting)
         gone = set(eliminated.components)
         updates = tuple(u for u in updates if not gone.issuperset(u.components))
-    sweeper = Sweeper(problem, updates, settings, interweaving, elimination)
+    sweep = SweepSetup(problem, updates, settings, interweaving, elimination)
     starts = setup.once(
         "starts", lambda: dispersed(space, pilot, setup.chains, setup.root, "bootstrap")
     )
@@ -96,7 +96,7 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
     for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
-        begun = start_chain(sweeper, theta, generator, stream)
+        begun = start_chain(sweep, theta, generator, stream)
         if not setup.states:
             begun = replace(begun, path_movement=PathMovement(setup.warmup))
         states.append(begun)
@@ -110,7 +110,7 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
         "interweaving": interweaved,
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
-    step = partial(pgas_block, sweeper, setup.thin, method.log_likelihood)
+    step = partial(pgas_block, sweep, setup.thin, method.log_likelihood)
     return PreparedChains(step, states, report)
 
 
@@ -120,13 +120,13 @@ def csmc_settings(problem: Problem, particles: int | None, proposal: str) -> Fil
         proposal = choose_for_csmc(problem)
     problem.proposal(proposal)
     if particles is None:
-        joined = deterministic_memory(problem.trace) is not None
-        particles = PARTICLES if joined else PARTICLES_WITHOUT_ANCESTORS
+        has_ancestor_sampling = deterministic_memory(problem.trace) is not None
+        particles = PARTICLES if has_ancestor_sampling else PARTICLES_WITHOUT_ANCESTORS
     return FilterSettings(int(particles), proposal)
 
 
 @dataclass(frozen=True)
-class Sweeper(GibbsUpdates):
+class SweepSetup(GibbsUpdates):
     """A problem with its updates: what one iteration of PGAS needs.
 
     settings : of the conditional particle filter. interweaving : the further steps of a sweep.
@@ -154,7 +154,7 @@ class PGASState:
 
 
 def start_chain(
-    sweeper: Sweeper, theta: np.ndarray, generator: np.random.Generator, stream: np.ndarray
+    sweep: SweepSetup, theta: np.ndarray, generator: np.random.Generator, stream: np.ndarray
 ) -> PGASState:
     """A chain at theta, with a path of a particle filter for its first trajectory.
 
@@ -162,28 +162,28 @@ def start_chain(
     ------
     SamplingError : no path has a positive density, even with many particles.
     """
-    problem, stream = sweeper.problem, stream.copy()
-    run = problem.program.entry(f"filtered_path_{sweeper.settings.proposal}")
+    problem, stream = sweep.problem, stream.copy()
+    run = problem.program.entry(f"filtered_path_{sweep.settings.proposal}")
     paths = []
     for e in problem.experiments:
         path = np.empty((e.steps, len(problem.trace.state_symbols)))
-        particles, status, t = max(200, sweeper.settings.particles), -1, 0
+        particles, status, t = max(200, sweep.settings.particles), -1, 0
         while status != OK and particles <= 200_000:
             status, t, _ = run(theta, e.y, e.seen, e.u, particles, stream, path, np.empty(e.steps))
             particles *= 8
         if status != OK:
             raise failure(problem, theta, status, t, e)
         paths.append(path)
-    interweaving = sweeper.interweaving
+    interweaving = sweep.interweaving
     tuning = interweaving.begin() if interweaving is not None else None
-    elimination, elimination_state = sweeper.elimination, None
+    elimination, elimination_state = sweep.elimination, None
     if elimination is not None:
         elimination_state = elimination.begin(theta, tuple(paths))
     return PGASState(theta.copy(), tuple(paths), generator, stream, tuning, elimination_state)
 
 
 def pgas_block(
-    sweeper: Sweeper, thin: int, predictive: bool, state: PGASState, n: int
+    sweep: SweepSetup, thin: int, predictive: bool, state: PGASState, n: int
 ) -> tuple[PGASState, Block]:
     """n draws of one chain, each after `thin` sweeps.
 
@@ -191,7 +191,7 @@ def pgas_block(
     """
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
     theta, paths, tuning = state.theta.copy(), [p.copy() for p in state.paths], state.tuning
-    interweaving, elimination = sweeper.interweaving, sweeper.elimination
+    interweaving, elimination = sweep.interweaving, sweep.elimination
     elimination_state = state.elimination_state
     path_movement, draws = state.path_movement, dict[str, list[np.ndarray]](theta=[])
     draws |= {f"path_{i}": [] for i in range(len(paths)) if path_movement is None}
@@ -206,8 +206,8 @@ def pgas_block(
                     elimination_state, theta, paths, stream, generator
                 )
             else:
-                rates = _trajectories(sweeper, theta, paths, stream)
-            infos = draw_parameters(sweeper, theta, paths, generator)
+                rates = run_conditional_smc(sweep, theta, paths, stream)
+            infos = draw_parameters(sweep, theta, paths, generator)
             if interweaving is not None and tuning is not None:
                 tuning, share = interweaving.step(tuning, theta, paths, generator)
                 interweaved += share / thin
@@ -219,9 +219,9 @@ def pgas_block(
         for i, path in enumerate(paths if path_movement is None else ()):
             draws[f"path_{i}"].append(path.copy())
         if predictive:
-            for i, increments in enumerate(_predictive(sweeper, theta, stream)):
+            for i, increments in enumerate(_predictive(sweep, theta, stream)):
                 draws.setdefault(f"increment_{i}", []).append(increments)
-        stats["lp"].append(log_joint(sweeper, theta, paths))
+        stats["lp"].append(log_joint(sweep, theta, paths))
         stats["update_rate"].append(moved)
         stats["ess"].append(ess)
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
@@ -233,10 +233,10 @@ def pgas_block(
     return state, Block.of(draws, stats)
 
 
-def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:
+def _predictive(sweep: SweepSetup, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:
     """log p(y_t | y_1:t-1, theta) of each experiment, (T,); -inf from where the filter dies."""
-    problem = sweeper.problem
-    run = problem.program.entry(f"filter_{sweeper.settings.proposal}")
+    problem = sweep.problem
+    run = problem.program.entry(f"filter_{sweep.settings.proposal}")
     own = stream.copy()  # a stream beside the chain's, so that the draws stay the same without
     own[1] ^= np.uint64(0x5851F42D4C957F2D)
     out = []
@@ -249,15 +249,15 @@ def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list
     return out
 
 
-def _trajectories(
-    sweeper: Sweeper, theta: np.ndarray, paths: list[np.ndarray], stream: np.ndarray
+def run_conditional_smc(
+    sweep: SweepSetup, theta: np.ndarray, paths: list[np.ndarray], stream: np.ndarray
 ) -> tuple[float, float]:
     """New trajectories given theta, in place; (share of steps that changed, ESS / N)."""
-    problem, settings, every = sweeper.problem, sweeper.settings, sweeper.problem.end_to_end
+    problem, settings, every = sweep.problem, sweep.settings, sweep.problem.end_to_end
     one = problem.program.entry(f"conditional_smc_{settings.proposal}")
     old, figures = joined(paths), np.empty((len(paths), 2))
     new = np.empty_like(old)
-    status, t, e = for_each(conditional_smc_each, one)(
+    status, t, e = over_data_sets(conditional_smc_each, one)(
         theta, *every.data, settings.particles, stream, old, new, figures
     )
     if status != OK:

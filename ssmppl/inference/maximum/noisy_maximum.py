@@ -64,7 +64,7 @@ class LocalMaximum:
     def __str__(self) -> str:
         each = f", by {self.runs} filters each" if self.runs > 1 else ""
         where = f"at {self.points} points round it{each}"
-        return f"top of a quadratic fitted to the log-likelihood {where}"
+        return f"maximum of a quadratic fitted to the log-likelihood {where}"
 
 
 @dataclass

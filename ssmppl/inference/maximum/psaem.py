@@ -26,7 +26,7 @@ import numpy as np
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.pgas import (
-    Sweeper,
+    SweepSetup,
     csmc_settings,
     start_chain,
 )
@@ -55,7 +55,7 @@ def climb(setup: Maximization, method: PSAEM) -> Ascent:
     for chain, theta in enumerate(starts(setup, method.chains)):
         seed = setup.seed(2, chain)
         begun = start_chain(
-            Sweeper(setup.problem, (), settings), theta, np.random.default_rng(seed),
+            SweepSetup(setup.problem, (), settings), theta, np.random.default_rng(seed),
             random_state(seed),
         )  # fmt: skip
         states.append(PSAEMState(theta, begun.paths, begun.stream, np.empty(0), 0))

@@ -431,7 +431,7 @@ class IF2:
     averaged : last iterations that an end is the mean of, on the unconstrained scale.
     evaluations : estimates of the likelihood at each end.
     points : places at which the likelihood is estimated round where the runs ended, to find the
-        top there. The estimate is the top of a quadratic fitted to them, its curvature gives the
+        maximum. The estimate is the maximum of a quadratic fitted to them, its curvature gives the
         standard errors, and the noise of the estimates its Monte Carlo error (Ionides, Bretó, Park,
         Smith and King 2017). None: 24 for each coefficient of the quadratic, at least 160. 0: none
         of this; the estimate is where the runs ended, how far that is off is not known, and only

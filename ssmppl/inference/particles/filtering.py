@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.codegen.kernels.panels.each import filter_each
+from ssmppl.codegen.kernels.data_sets.each import filter_each
 from ssmppl.codegen.kernels.particle.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN, OK
-from ssmppl.codegen.native.entries import ByAddress, for_each
+from ssmppl.codegen.native.entries import ByAddress, over_data_sets
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
@@ -159,7 +159,7 @@ def _estimate_of_all(
     """As `log_likelihood_estimate`, in one compiled pass; one : the filter of a data set."""
     every, scheme = problem.end_to_end, None if settings.scheme == SYSTEMATIC else settings.scheme
     increments, ess = np.empty(problem.rows), np.empty(problem.rows)
-    status, t, e = for_each(filter_each, one)(
+    status, t, e = over_data_sets(filter_each, one)(
         theta, *every.data, settings.particles, scheme, settings.ess_threshold, rng, increments, ess
     )
     if status == ALL_ZERO:

@@ -78,7 +78,7 @@ class Sent:
                     content = packed(self.function)
                 except Exception as error:
                     raise ArgumentError(
-                        f"the task cannot be sent to another process: {_told(error)}",
+                        f"the task cannot be sent to another process: {_error_text(error)}",
                         fix="install cloudpickle, or define what is named here at the top of a "
                         "module that the workers can import, or use threads (executor=None)",
                     ) from error
@@ -124,7 +124,7 @@ def _opened(content: bytes) -> Callable[..., Any]:
         function: Callable[..., Any] = unpacked(content)
     except Exception as error:
         raise ExecutorError(
-            f"a worker cannot restore the task: {_told(error)}",
+            f"a worker cannot restore the task: {_error_text(error)}",
             fix="workers need the same versions of Python, NumPy, Numba and ssmppl, and must find "
             "the modules that hold the model's @ssm.primitive and @ssm.effect functions "
             "(PYTHONPATH of the workers; with Dask also client.upload_file)",
@@ -132,7 +132,7 @@ def _opened(content: bytes) -> Callable[..., Any]:
     return function
 
 
-def _told(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
@@ -160,7 +160,7 @@ def lost_worker(error: BaseException) -> ExecutorError | None:
         )  # fmt: skip
     else:
         return None
-    return ExecutorError(f"{found}: {_told(error)}", fix=fix)
+    return ExecutorError(f"{found}: {_error_text(error)}", fix=fix)
 
 
 def error_of(future: Future[Any]) -> BaseException | None:

@@ -107,8 +107,9 @@ class BatchedFunction:
                 k = int(np.argmax(bad))
                 lost = ", ".join(np.array(self.results)[np.isnan(values[k])])
                 warnings.warn(
-                    f"the simulator {self.title} gives NaN for {lost} at {self._told(points[k])}"
-                    f"{self._reason(points[k])}; where it does the likelihood is zero",
+                    f"the simulator {self.title} gives NaN for {lost} at "
+                    f"{self._point_text(points[k])}{self._reason(points[k])}; where it does the "
+                    "likelihood is zero",
                     stacklevel=2,
                 )
         return values
@@ -202,7 +203,7 @@ class BatchedFunction:
         k, j = np.unravel_index(int(np.argmax(~((a == b) | (np.isnan(a) & np.isnan(b))))), a.shape)
         return self._error(
             f"{what}: {when} {self.results[j]} = {b[k, j]:.9g} where it gave {a[k, j]:.9g} before, "
-            f"at {self._told(points[k])}",
+            f"at {self._point_text(points[k])}",
             fix,
         )
 
@@ -222,14 +223,14 @@ class BatchedFunction:
         lines = [*traceback.format_list(frames), *traceback.format_exception_only(error)]
         trace = "".join(lines).rstrip()
         return self._error(
-            f"raised {type(error).__name__} at {self._told(point)}\n{trace}",
+            f"raised {type(error).__name__} at {self._point_text(point)}\n{trace}",
             "mend the function, or return NaN where it has no value",
         )
 
     def _error(self, what: str, fix: str) -> SimulatorError:
         return SimulatorError(f"the simulator {self.title} {what}", fix=fix, where=self.where)
 
-    def _told(self, point: np.ndarray) -> str:
+    def _point_text(self, point: np.ndarray) -> str:
         pairs = [f"{n} = {v:.6g}" for n, v in zip(self.arguments, point, strict=False)]
         row = f"row {int(point[-1])}: " if point[-1] > 0 else ""
         return row + ", ".join(pairs)

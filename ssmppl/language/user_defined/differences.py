@@ -185,11 +185,6 @@ def _moved(j: int, place: int) -> str:
     return f"x{j} {'+' if place > 0 else '-'} {'' if abs(place) == 1 else f'{abs(place)}.0 * '}h{j}"
 
 
-def order_told(order: int) -> str:
-    """What is said of the differences of an order."""
-    return f"steps of about {STEPS[order]:.0e} of the argument"
-
-
 def close(given: float, found: float, value: float, size: float) -> bool:
     """Whether a derivative agrees with what differences found, within their error.
 

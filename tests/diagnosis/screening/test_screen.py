@@ -45,7 +45,7 @@ def test_a_jump_is_found_where_it_was_and_as_large_as_it_was():
     best = int(found.family.best[np.argmin(found.family.p)])
     c = found.design.candidates[best]
     assert c.effect.name == "level break"
-    assert found.significant[best] <= 0.05
+    assert found.candidate_p[best] <= 0.05
     # A row off costs BREAK^2 / 2 r^2 = 18 nats.
     assert dict(c.shape)["date"] == DATE
     error = 1.0 / np.sqrt(found.efficient.variance[best])
@@ -163,4 +163,4 @@ def test_a_strength_has_the_sign_that_its_bounds_leave(rise):
             assert found.efficient.gain[k] > 1.0
         else:
             assert found.efficient.gain[k] == 0.0
-            assert found.significant[k] > 0.5
+            assert found.candidate_p[k] > 0.5

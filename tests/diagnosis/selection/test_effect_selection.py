@@ -277,7 +277,7 @@ def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left)
 )
 def test_what_leads_and_could_not_be_refitted(refitted, gain, p, expected):
     screen = screen_of([6.0, 3.0, 0.5], np.eye(3))
-    screen.significant = np.array([p, 0.2, 1.0])
+    screen.candidate_p = np.array([p, 0.2, 1.0])
     refits = [Refit((k,), (), None, None, gain) for k in refitted]
     assert module._unfitted(screen, refits, 0.025) == expected
 

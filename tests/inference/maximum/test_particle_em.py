@@ -10,7 +10,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.datasets import ice_varves, load
-from ssmppl.inference.chains.pgas import Sweeper, csmc_settings, start_chain
+from ssmppl.inference.chains.pgas import SweepSetup, csmc_settings, start_chain
 from ssmppl.inference.maximum.em import ExactSteps
 from ssmppl.inference.maximum.m_step import fixed_point, maximiser, ratio_weights
 from ssmppl.inference.maximum.particle_em import climb as climb_particle_em
@@ -34,8 +34,8 @@ SWEEPS = {"chains": 4, "dropped": 100, "kept": 3000}
 
 def started(setup, theta, settings, *seed):
     root = np.random.SeedSequence(seed_of(*seed))
-    sweeper = Sweeper(setup.problem, (), settings)
-    begun = start_chain(sweeper, theta, np.random.default_rng(root), random_state(root))
+    sweep = SweepSetup(setup.problem, (), settings)
+    begun = start_chain(sweep, theta, np.random.default_rng(root), random_state(root))
     return begun.paths, begun.stream
 
 

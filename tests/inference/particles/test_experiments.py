@@ -7,8 +7,8 @@ import pytest
 from scipy import integrate, stats
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.panels.each import filter_each
-from ssmppl.codegen.native.entries import ByAddress, for_each
+from ssmppl.codegen.kernels.data_sets.each import filter_each
+from ssmppl.codegen.native.entries import ByAddress, over_data_sets
 from ssmppl.errors import SamplingError
 from ssmppl.inference.chains.gibbs_updates import (
     GibbsUpdates,
@@ -17,7 +17,7 @@ from ssmppl.inference.chains.gibbs_updates import (
     plan_updates,
 )
 from ssmppl.inference.chains.interweaving import NoiseMove, noises
-from ssmppl.inference.chains.pgas import Sweeper, _trajectories, csmc_settings
+from ssmppl.inference.chains.pgas import SweepSetup, csmc_settings, run_conditional_smc
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
 from ssmppl.inference.run.problem import EndToEnd, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -96,7 +96,7 @@ def test_without_addresses_the_loop_is_pythons(problem):
     for one in (run, lambda *arguments: run(*arguments)):
         increments, ess = np.empty(problem.rows), np.empty(problem.rows)
         given = THETA, *problem.end_to_end.data, 40, None, 1.0, new_stream(), increments, ess
-        assert for_each(filter_each, one)(*given)[0] == 0
+        assert over_data_sets(filter_each, one)(*given)[0] == 0
         found.append(increments)
     np.testing.assert_array_equal(*found)
 
@@ -105,11 +105,11 @@ def test_sweeps_of_all_are_the_sweeps_of_each(problem):
     settings = csmc_settings(problem, 15, "bootstrap")
     paths, apart = a_path(problem), a_path(problem)
     stream, other = new_stream(), new_stream()
-    rates = _trajectories(Sweeper(problem, (), settings), THETA, paths, stream)
+    rates = run_conditional_smc(SweepSetup(problem, (), settings), THETA, paths, stream)
     each = []
     for p, path in zip(alone(problem), apart, strict=True):
         own = [path]
-        each.append(_trajectories(Sweeper(p, (), settings), THETA, own, other))
+        each.append(run_conditional_smc(SweepSetup(p, (), settings), THETA, own, other))
         np.testing.assert_array_equal(paths[len(each) - 1], own[0])
     np.testing.assert_allclose(rates, np.mean(each, axis=0), rtol=1e-14)
     np.testing.assert_array_equal(stream, other)
@@ -160,7 +160,7 @@ def test_a_row_that_cannot_be_is_that_of_its_data_set():
     settings = csmc_settings(strict, 5, "bootstrap")
     paths = [np.zeros((3, 1)), np.zeros((3, 1))]
     with pytest.raises(SamplingError, match=r"t=3, where y = 99"):
-        _trajectories(Sweeper(strict, (), settings), np.empty(0), paths, new_stream())
+        run_conditional_smc(SweepSetup(strict, (), settings), np.empty(0), paths, new_stream())
 
 
 def test_many_initial_laws_leave_rejection_to_slices(monkeypatch):
