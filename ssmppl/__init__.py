@@ -1,8 +1,8 @@
 """A probabilistic-programming language for state space models.
 
-Declare priors, initial law, transition and observation as decorated functions of a `Model`; the
-verbs below derive and compile the rest. The diagnosis and its plots are imported when they are
-first asked for: most sessions never do, and they make up a third of the package.
+Declare priors, initial distribution, transition and observation as decorated functions of a
+`Model`; the verbs below derive and compile the rest. The diagnosis and its plots are imported when
+they are first asked for: most sessions never do, and they make up a third of the package.
 """
 
 import importlib

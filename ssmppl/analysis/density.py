@@ -24,7 +24,7 @@ class Missing:
     """What the data lack, as far as the generated code depends on it.
 
     none : every entry was measured, so no term is ever left out.
-    partial : names of channels with a joint law of which single components are missing.
+    partial : names of channels with a joint distribution of which single components are missing.
     """
 
     none: bool = False
@@ -99,8 +99,8 @@ def any_of(masks: ExprArray) -> Expr:
 def marginal_normal(d: MvNormal, value: ExprArray, masks: ExprArray, guard: bool = True) -> Expr:
     """Log density of the measured components of a Gaussian vector.
 
-    With m the 0/1 vector of measured components, the marginal law of these is that of m * y
-    under covariance (m m') * C + diag(1 - m), less the unit variances of the others.
+    With m the 0/1 vector of measured components, the marginal distribution of these is that of m *
+    y under covariance (m m') * C + diag(1 - m), less the unit variances of the others.
 
     guard : -inf where what was measured has no covariance that is positive definite. The formula
         may have any value there, +inf too: [[0, c], [c, 1]], whose 0 is a square that underflowed,

@@ -1,9 +1,9 @@
 """Finite states: models whose states take few values, and those values.
 
-Of Categorical, Bernoulli and Binomial laws, and of Truncated counts between numbers, the values are
-known; a deterministic component (a lag, a duration that starts over) takes those of its expression
-over the values of what it depends on, iterated until nothing new turns up. Every round but the last
-adds a value, so that a counter without end soon has too many.
+Of Categorical, Bernoulli and Binomial distributions, and of Truncated counts between numbers, the
+values are known; a deterministic component (a lag, a duration that starts over) takes those of its
+expression over the values of what it depends on, iterated until nothing new turns up. Every round
+but the last adds a value, so that a counter without end soon has too many.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _combinations(domain: Mapping[Expr, tuple[float, ...]]) -> int:
 
 
 def _values(site: Site) -> list[tuple[float, ...]] | NotApplicable:
-    """Of each component of a law that is not deterministic."""
+    """Of each component of a distribution that is not deterministic."""
     d, where = site.distribution, site.distribution.location
     support = d.support()
     if support.kind != "integers":

@@ -1,4 +1,4 @@
-"""Laws of a step that read new values of other states, x_t beside x_{t-1}.
+"""Distributions of a step that read new values of other states, x_t beside x_{t-1}.
 
 They stand in an order in which each reads new values of earlier ones only, so that p(x_t | x_{t-1})
 is the product of their densities as they are. What is drawn, or derived from the past alone, has
@@ -14,7 +14,7 @@ from ssmppl.language.model.trace import Site
 
 
 def reads_of(site: Site) -> frozenset[Expr]:
-    """The symbols in a law, those of its own value not among them."""
+    """The symbols in a distribution, those of its own value not among them."""
     found = symbols_of(site.distribution.arguments())
     return frozenset(found) - frozenset(site.components)
 

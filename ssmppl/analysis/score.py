@@ -10,7 +10,7 @@ that its derivatives in theta are carried along by the recursion that gives its 
 and once more for second derivatives: these sensitivities are further columns of the trajectory.
 
 The identities need a density that changes continuously with theta: a support that depends on a
-parameter, or a law that changes by steps in it, excludes that parameter.
+parameter, or a distribution that changes by steps in it, excludes that parameter.
 """
 
 from __future__ import annotations

@@ -49,12 +49,12 @@ class GaussianBlock:
 def gaussian_block(
     sites: Sequence[Site], dirac: bool = False, given: Collection[Expr] = ()
 ) -> GaussianBlock:
-    """The Normal and MvNormal sites stacked, in the order of their laws; empty where there are
-    none. A mean m + B x in new values x of the block has them put in: m + B mean(x), with the
+    """The Normal and MvNormal sites stacked, in the order of their distributions; empty where there
+    are none. A mean m + B x in new values x of the block has them put in: m + B mean(x), with the
     covariance B cov(x) B' beside its own.
 
     dirac : the deterministic sites too, with no variance of their own. given : components that are
-    no part of it, whatever their laws.
+    no part of it, whatever their distributions.
     """
     symbols: list[Expr] = []
     mean: list[Expr] = []
@@ -160,7 +160,8 @@ class AffineObservation:
 def affine_observation(
     sites: Sequence[Site], states: Sequence[Expr], following: Mapping[Expr, Expr] | None = None
 ) -> AffineObservation | NotApplicable:
-    """All observations as one affine Gaussian law in `states`; the reason where one is not.
+    """All observations as one affine Gaussian distribution in `states`; the reason where one is
+    not.
 
     following : further components that are functions of the states, and are put in first.
     """
@@ -185,7 +186,8 @@ def affine_observation(
 def _not_affine(
     site: Site, role: str, states: Sequence[Expr], known: dict[Expr, Expr] | None = None
 ) -> NotApplicable | None:
-    """Why a Gaussian or deterministic law is not affine in `states` with a spread free of them."""
+    """Why a Gaussian or deterministic distribution is not affine in `states` with a spread free of
+    them."""
     d = site.distribution
     form = affine(substitute(list(array(d.mean()).ravel()), known or {}), states)
     if isinstance(form, NotApplicable):
@@ -202,7 +204,7 @@ class LinearGaussian:
     """x_1 ~ N(m, P), x_t = A x_{t-1} + b + N(0, Q), y_t = C x_t + d + N(0, R); x in trace order.
 
     Entries may depend on theta, inputs, time and (in A, b, Q) on y_{t-1}; Q and P may be singular
-    (Dirac components). flat : components of x_1 whose law is Flat; zero in m and P.
+    (Dirac components). flat : components of x_1 whose distribution is Flat; zero in m and P.
     """
 
     m: ExprArray
@@ -313,7 +315,7 @@ def singular_covariance(trace: Trace) -> NotApplicable | None:
 
 @once_per_trace
 def simulators(trace: Trace) -> tuple[Any, ...]:
-    """The functions under `@ssm.simulator` that the model's laws call, by name."""
+    """The functions under `@ssm.simulator` that the model's distributions call, by name."""
     sites = (trace.parameters, trace.initial, trace.transition, trace.observations)
     roots = [e for part in sites for site in part.values() for e in site.distribution.expressions()]
     found = {n.data.function for n in topological(roots) if n.op == OP}
@@ -321,12 +323,13 @@ def simulators(trace: Trace) -> tuple[Any, ...]:
 
 
 def flat_start(trace: Trace) -> list[Site]:
-    """The states that have no proper initial law."""
+    """The states that have no proper initial distribution."""
     return [s for s in trace.initial.values() if isinstance(s.distribution, Flat)]
 
 
 def check_start(trace: Trace) -> None:
-    """Refuse flat initial laws but in a linear Gaussian model, where there is an exact answer.
+    """Refuse flat initial distributions but in a linear Gaussian model, where there is an exact
+    answer.
 
     Raises
     ------
@@ -357,7 +360,7 @@ def without_noise(trace: Trace) -> NotApplicable | None:
 
 
 def noisy_start(trace: Trace) -> list[Site]:
-    """The states whose initial law has noise, where no transition has any; else none."""
+    """The states whose initial distribution has noise, where no transition has any; else none."""
     if any(not isinstance(s.distribution, Dirac) for s in trace.transition.values()):
         return []
     return [s for s in trace.initial.values() if not isinstance(s.distribution, Dirac)]

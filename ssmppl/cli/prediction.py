@@ -139,9 +139,9 @@ def forecast(
 ) -> None:  # fmt: skip
     """Draws of states and observations after the last row of the data.
 
-    Each draw of POSTERIOR.nc, which `ssmppl sample` wrote with its states, is continued by the laws
-    of MODEL.py; with --parameters draws of the last state given DATA are. Prints mean, standard
-    deviation and quantiles at each row, and writes the draws to a netCDF file, which
+    Each draw of POSTERIOR.nc, which `ssmppl sample` wrote with its states, is continued by the
+    distributions of MODEL.py; with --parameters draws of the last state given DATA are. Prints
+    mean, standard deviation and quantiles at each row, and writes the draws to a netCDF file, which
     xarray.open_dataset reads.
 
     \b

@@ -1,6 +1,6 @@
-"""Laws that the inputs, the row number or earlier observations leave without a parameter that is a
-number: an index that no element has, the root of a negative number. Found before anything runs,
-where all that is left of it in a kernel is a likelihood of zero."""
+"""Distributions that the inputs, the row number or earlier observations leave without a parameter
+that is a number: an index that no element has, the root of a negative number. Found before anything
+runs, where all that is left of it in a kernel is a likelihood of zero."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHUNK = 1 << 16  # rows that are looked at together
 
 
 class _Suspect(NamedTuple):
-    """An entry of a law's parameter that may have no value in some row."""
+    """An entry of a distribution's parameter that may have no value in some row."""
 
     site: Site
     law: Distribution  # the site's, or one inside of it
@@ -72,18 +72,18 @@ def check_defined(
     measured: np.ndarray | None = None,
     after: int = 0,
 ) -> None:
-    """Raise where a parameter of a law is not a number whatever states and parameters are.
+    """Raise where a parameter of a distribution is not a number whatever states and parameters are.
 
     u : (T, U) inputs.
     y : (T, K) observations, NaN where missing; None where they are drawn.
-    measured : (T, K) whether an observation is weighed; the laws of others do not matter. None: all
-        are drawn.
+    measured : (T, K) whether an observation is weighed; the distributions of others do not matter.
+        None: all are drawn.
     after : of a forecast, the number of rows before those of `source`, whose last one is gone on
-        from; the laws of these rows do not matter.
+        from; the distributions of these rows do not matter.
 
     Raises
     ------
-    DataError : names the input, its row, and the law with its line.
+    DataError : names the input, its row, and the distribution with its line.
     """
     suspects = _suspects(trace)
     if not any(suspects.values()):

@@ -95,7 +95,7 @@ def lgss_main_text() -> np.ndarray:
 
     x_1 ~ N(0, 1/(0.51 theta)), x_{t+1} = 0.7 x_t + N(0, 1/theta), y_t = 0.5 x_t + N(0, 0.1) with
     variances as second arguments and theta = 1: the example in the main text of Schön et al.
-    (2015). Simulated anew from these laws; it is not the series plotted there.
+    (2015). Simulated anew from these distributions; it is not the series plotted there.
 
     Returns
     -------

@@ -433,7 +433,7 @@ def _matrix_name(node: Expr) -> str | None:
 
 
 def _bare(a: Expr) -> Expr:
-    """a of where(0 <= a, a, nan): what the densities of laws put in place of their a."""
+    """a of where(0 <= a, a, nan): what the densities of distributions put in place of their a."""
     if a.op == "where" and a.args[2].op == "const" and math.isnan(a.args[2].data):
         return a.args[1] if a.args[0] is behaviour["apply"]("le", 0.0, a.args[1]) else a
     return a

@@ -78,7 +78,7 @@ def _log_mass(k: int, n: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray
 
 
 def _trials(n: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, int]:
-    """Where the law exists, and the most trials there."""
+    """Where the distribution exists, and the most trials there."""
     sound = (n >= 0) & (n < np.inf) & (n == np.floor(n))
     sound &= (a > 0) & (a < np.inf) & (b > 0) & (b < np.inf)
     return sound, int(np.max(n[sound], initial=0.0))
@@ -170,7 +170,7 @@ def _smallest(tail: Callable[[np.ndarray], Any], q: Any, reached: np.ufunc) -> n
 
 
 def vonmises_cdf(concentration: Any, x: Any) -> np.ndarray:
-    """P(X <= x), -pi <= x <= pi, for a von Mises law round 0, by Gauss-Legendre."""
+    """P(X <= x), -pi <= x <= pi, for a von Mises distribution round 0, by Gauss-Legendre."""
     kappa, x = _wide(concentration, x)
     edge = -np.abs(x)
     most = 2.0 * np.sin(0.5 * edge) ** 2  # 1 - cos

@@ -258,7 +258,8 @@ class _Tracer:
         return value[()] if shape == () else value
 
     def _given_by(self, function: Callable[..., Any]) -> Mapping[str, Any]:
-        """The laws that a transition function would return, run on stand-ins for new values."""
+        """The distributions that a transition function would return, run on stand-ins for new
+        values."""
         arguments = {}
         for name in inspect.signature(function).parameters:
             value = self._argument(name, "transition")

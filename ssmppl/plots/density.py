@@ -28,7 +28,8 @@ PRIOR_DRAWS = 4000
 class Prior:
     """The prior of one scalar.
 
-    site : its law, where that has a density that does not depend on other parameters; or draws,
+    site : its distribution, where that has a density that does not depend on other parameters; or
+        draws,
     (n,), from it; neither where it is improper. lower, upper : ends of the support.
     """
 
@@ -72,7 +73,7 @@ def supports(traced: Trace) -> dict[str, tuple[float, float]]:
 
 def priors_of(model: Model) -> dict[str, Prior]:
     """The prior of each component of the parameters: exactly, or by draws where it depends on
-    others or is the margin of a joint law."""
+    others or is the margin of a joint distribution."""
     traced = trace(model)
     ends = supports(traced)
     draws: np.ndarray | None = None

@@ -150,7 +150,7 @@ def _drawn(idata: Any) -> list[Record]:
 
 def _limits(ax: Any, record: Record, name: str) -> None:
     """Room for the data and the bands, but no more than what lets the data be seen: the first
-    predictions of a vague initial law are far wider than all others."""
+    predictions of a vague initial distribution are far wider than all others."""
     y, outer = record.data[name], record.states[name][[0, 4]]
     y = y[np.isfinite(y)]
     if not len(y) or not np.isfinite(outer).any():

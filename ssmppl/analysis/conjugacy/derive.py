@@ -2,9 +2,10 @@
 
 `derive_updates` looks for the largest blocks with a closed-form conditional (`search.py`), by the
 table of families (`families.py`). What lies outside a family's span, if it comes from the prior or
-the initial law only (a bounded number of terms, however long the series), becomes a correction of
-the draw; if it grows with the series, the block is sampled by slices on its exact conditional.
-Every update is compared with the model's own density when it is derived (`numerical_check.py`).
+the initial distribution only (a bounded number of terms, however long the series), becomes a
+correction of the draw; if it grows with the series, the block is sampled by slices on its exact
+conditional. Every update is compared with the model's own density when it is derived
+(`numerical_check.py`).
 """
 
 from __future__ import annotations
@@ -172,7 +173,8 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
 
 
 def _known(update: Update, i: int) -> float | None:
-    """The statistic at a position that prior and initial law alone give, if it is a number."""
+    """The statistic at a position that prior and initial distribution alone give, if it is a
+    number."""
     parts = [update.coefficients[r][i] for r in BOUNDED_ROLES] if i >= 0 else []
     return math.fsum(e.data for e in parts) if all(e.op == "const" for e in parts) else None
 

@@ -1,8 +1,8 @@
-"""Updates in words: what is drawn, from which law, with which statistics.
+"""Updates in words: what is drawn, from which distribution, with which statistics.
 
 A block of few numbers is described function by function. One of vectors or matrices is described
-by sums of outer products, read off the laws (Normal or MvNormal, mean affine in the block) that it
-enters; by its functions where these laws are of another kind.
+by sums of outer products, read off the distributions (Normal or MvNormal, mean affine in the block)
+that it enters; by its functions where these distributions are of another kind.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Explanation:
 def prior_alone(
     components: Sequence[Expr], hyperparameters: Sequence[str], how: str
 ) -> Explanation:
-    """The explanation of a block that no law of the model reads, moved as `how` says."""
+    """The explanation of a block that no distribution of the model reads, moved as `how` says."""
     given = f", given {', '.join(hyperparameters)}," if hyperparameters else ""
     verb, noun = ("does", "its") if len(components) == 1 else ("do", "their")
     return Explanation(
@@ -219,7 +219,7 @@ def _whole_power(node: Expr) -> bool:
 # -- the law
 @dataclass(frozen=True)
 class Wording:
-    """What a family writes its law with. name : of the block as a whole."""
+    """What a family writes its distribution with. name : of the block as a whole."""
 
     form: BlockForm
     name: str
@@ -345,7 +345,7 @@ class MatrixWording:
 
     # -- the families
     def normal(self) -> tuple[str, ...] | None:
-        """H and h, as sums over the laws whose means hold the block."""
+        """H and h, as sums over the distributions whose means hold the block."""
         first = ["prior"] if self._told_by_prior() else []
         h, linear, notes = [*first], [*first], []
         for term, site in self.others:
@@ -431,7 +431,7 @@ class MatrixWording:
         return name if text == "0" else f"({name} - {_tight(text)})"
 
     def _weight(self, law: laws.Distribution) -> str:
-        """The precision of a law, as a matrix or, of one number, as a number."""
+        """The precision of a distribution, as a matrix or, of one number, as a number."""
         if isinstance(law, laws.MvNormal):
             text = matrix_text(law.parameters[law.spread])
             if law.spread == "cholesky":
@@ -445,7 +445,7 @@ class MatrixWording:
         return f"diag({self._vector(precisions)})"
 
     def _scale(self, site: Site) -> str | None:
-        """ "s " where the precision of a law is s times the block's (inverse) matrix."""
+        """ "s " where the precision of a distribution is s times the block's (inverse) matrix."""
         law = site.distribution
         if not isinstance(law, laws.MvNormal) or law.spread == "cholesky":
             return None

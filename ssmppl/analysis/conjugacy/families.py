@@ -1,9 +1,9 @@
-"""The conjugate families: functions of a block on the left, its law on the right.
+"""The conjugate families: functions of a block on the left, its distribution on the right.
 
     log p(block | rest) = const + sum_i C_i s_i(block)
 
 =================================================  =============================================
-functions s_i in the span                          law
+functions s_i in the span                          distribution
 =================================================  =============================================
 log v, v**k                                        v**k ~ Gamma   (k = 1: precisions, rates;
                                                    k = -1: variances; k = -2: sds)
@@ -17,9 +17,10 @@ log det W, W_ij, W_ij theta_jk, W_ij theta_ik      matrix Normal-Wishart (W = P)
 theta_jl                                           matrix Normal-inverse-Wishart (W = C^-1)
 =================================================  =============================================
 
-(Bernardo and Smith (1994), "Bayesian theory", appendix A.) A law is determined by the functions
-alone, never by a distribution's name. All that is known of one is in its class, by the protocol of
-`family.py`; the last lines below are the list that is searched. Matrices: `matrix_families.py`.
+(Bernardo and Smith (1994), "Bayesian theory", appendix A.) A distribution is determined by the
+functions alone, never by a distribution's name. All that is known of one is in its class, by the
+protocol of `family.py`; the last lines below are the list that is searched. Matrices:
+`matrix_families.py`.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
     log p(block | rest) = const + sum_i C_i s_i(block)
 
-A family is a law that is spanned by given functions s_i of a block. It holds their positions among
-the functions of the block, and computes from the statistics C whatever is asked of the law. C has a
-0 at its end, so that position -1 stands for a function that is absent.
+A family is a distribution that is spanned by given functions s_i of a block. It holds their
+positions among the functions of the block, and computes from the statistics C whatever is asked of
+the distribution. C has a 0 at its end, so that position -1 stands for a function that is absent.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ ZERO = constant(0.0)
 
 
 class Family(ABC):
-    """A law of a block, by the positions of its functions.
+    """A distribution of a block, by the positions of its functions.
 
-    kind : of the blocks that it may be the law of: "real", "simplex" or "matrix".
+    kind : of the blocks that it may be the distribution of: "real", "simplex" or "matrix".
     written_out : whether it has a normalising constant and a draw in expressions.
     """
 
@@ -50,7 +50,8 @@ class Family(ABC):
     # -- which law it is
     @classmethod
     def match(cls, components: Sequence[Expr], form: BlockForm, positive: bool) -> Sequence[Family]:
-        """Laws of the block whose functions its form has; positive : whether its support is."""
+        """Distributions of the block whose functions its form has; positive : whether its support
+        is."""
         raise NotImplementedError
 
     @property
@@ -61,7 +62,7 @@ class Family(ABC):
     @property
     @abstractmethod
     def used(self) -> frozenset[int]:
-        """Positions of the functions that the law holds."""
+        """Positions of the functions that the distribution holds."""
 
     @property
     @abstractmethod
@@ -81,7 +82,7 @@ class Family(ABC):
     # -- in numbers
     @abstractmethod
     def draw(self, c: Statistics, rng: np.random.Generator) -> Values | None:
-        """The block's values; None where the law is improper with these statistics."""
+        """The block's values; None where the distribution is improper with these statistics."""
 
     def draw_within(self, c: Statistics, limits: Limits, rng: np.random.Generator) -> Values | None:
         """A draw within the limits; of a family that cannot aim at them, any draw."""
@@ -90,7 +91,7 @@ class Family(ABC):
     def draw_last(
         self, c: Statistics, values: Statistics, limits: Limits, rng: np.random.Generator
     ) -> float | None:
-        """The last component drawn given the others; None where its law is not known, or
+        """The last component drawn given the others; None where its distribution is not known, or
         improper."""
         return None
 
@@ -119,18 +120,19 @@ class Family(ABC):
         raise NotImplementedError
 
     def written_draw(self, c: Sequence[Expr], draws: Draws) -> list[Expr]:
-        """A draw of the components from the law with density exp(sum_i C_i s_i) / Z(C)."""
+        """A draw of the components from the distribution with density exp(sum_i C_i s_i) / Z(C)."""
         raise NotImplementedError
 
     # -- in words
     @abstractmethod
     def law(self, words: Wording) -> str:
-        """The law with its parameters in terms of the statistics."""
+        """The distribution with its parameters in terms of the statistics."""
 
     def when_improper(self, known: Callable[[int], float | None]) -> str:
-        """What is done where the law is improper; "" where it never is.
+        """What is done where the distribution is improper; "" where it never is.
 
-        known : of a position, the statistic of prior and initial law alone, if it is a number.
+        known : of a position, the statistic of prior and initial distribution alone, if it is a
+            number.
         """
         return ""
 
@@ -140,14 +142,14 @@ class Family(ABC):
         return self.matrix_size > 0
 
     def matrix_statistics(self, words: MatrixWording) -> tuple[str, ...] | None:
-        """One line for each matrix that the law is made of; None where there is none."""
+        """One line for each matrix that the distribution is made of; None where there is none."""
         return None
 
 
 class ScaledFamily(Family):
     """A Normal block together with what scales its precision.
 
-    scale : the law of the latter by itself.
+    scale : the distribution of the latter by itself.
     """
 
     scale: ClassVar[type[Family]]
@@ -157,7 +159,7 @@ class ScaledFamily(Family):
     def match_scaled(
         cls, thetas: Sequence[Expr], scale: Sequence[Expr], form: BlockForm
     ) -> ScaledFamily | None:
-        """The law of the block (thetas, scale), if its form has the functions."""
+        """The distribution of the block (thetas, scale), if its form has the functions."""
 
 
 def held(positions: Iterable[int]) -> frozenset[int]:

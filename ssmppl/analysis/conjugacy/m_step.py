@@ -167,7 +167,7 @@ def counted(data: CompleteData, posterior: bool) -> CompleteData:
 
 
 def _as_update(free: Sequence[Expr], form: BlockForm) -> Update:
-    """Q as an update without a law: what sums its statistics and checks its algebra."""
+    """Q as an update without a distribution: what sums its statistics and checks its algebra."""
     return Update(
         block=tuple(dict.fromkeys(c.data[1] for c in free)),
         components=tuple(free),
@@ -352,8 +352,8 @@ def expected_density(
 def unsuited(data: CompleteData, free: Sequence[Expr]) -> NotApplicable | None:
     """Why the states cannot serve as missing data for these parameters, if they cannot.
 
-    Given the states, a deterministic law or a support that depends on a parameter determines it,
-    or cuts it off, so that Q has no interior maximum.
+    Given the states, a deterministic distribution or a support that depends on a parameter
+    determines it, or cuts it off, so that Q has no interior maximum.
     """
     found = degenerate(data, free)
     return found if found is not None else restricted(data, free)

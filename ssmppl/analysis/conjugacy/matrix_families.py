@@ -1,8 +1,8 @@
-"""Conjugate families of symmetric matrices: Wishart laws, alone and with a Normal matrix.
+"""Conjugate families of symmetric matrices: Wishart distributions, alone and with a Normal matrix.
 
-Bernardo and Smith (1994), "Bayesian theory", appendix A, for the Wishart laws; Rowe (2003),
-"Multivariate Bayesian statistics", section 4.3, for the matrix Normal joint with them. The table of
-all families is in `families.py`.
+Bernardo and Smith (1994), "Bayesian theory", appendix A, for the Wishart distributions; Rowe
+(2003), "Multivariate Bayesian statistics", section 4.3, for the matrix Normal joint with them. The
+table of all families is in `families.py`.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class MatrixNormalWishart(ScaledFamily):
 
     log q = C[log] log det(P or C) - tr(W (S_yy - A S_zy - S_yz A' + A K A')) / 2,
     A | W ~ Normal with mean M = S_yz K^-1 and cov(A_ik, A_jl) = (W^-1)_ij (K^-1)_kl,
-    W by its Wishart law with S = S_yy - S_yz K^-1 S_zy; its log det loses k / 2 to A.
+    W by its Wishart distribution with S = S_yy - S_yz K^-1 S_zy; its log det loses k / 2 to A.
 
     rows : A's entries as positions among the thetas. linear, quadratic : positions of the functions
     W_ii theta_ik (S_yz) and W_00 theta_0k theta_0l (K); what multiplies the others follows from
@@ -215,7 +215,7 @@ class MatrixNormalWishart(ScaledFamily):
         return len(self.rows) * len(self.rows[0])
 
     def parameters(self, c: Statistics) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """(df, S_yy, S_yz, K): df that of W's law, A integrated out."""
+        """(df, S_yy, S_yz, K): df that of W's distribution, A integrated out."""
         values = np.asarray(c)
         df, total = self.wishart.parameters(c)
         k = -values[np.array(self.quadratic)]

@@ -6,8 +6,8 @@ theta' of the block with all else fixed:
     log joint(theta') - log joint(theta) = log q(theta') - log q(theta)
 
 where the joint is the sum of the densities as they were written, not as they were separated, and q
-is the law that the family's formulas give for the summed statistics, times the correction. An
-error of the algebra, of a family's formulas or of the bookkeeping shows here and demotes the
+is the distribution that the family's formulas give for the summed statistics, times the correction.
+An error of the algebra, of a family's formulas or of the bookkeeping shows here and demotes the
 update.
 """
 
@@ -208,7 +208,7 @@ def random_series(
 def _fill(
     site: Site, values: Point, rng: np.random.Generator, spread: np.ndarray | None = None
 ) -> None:
-    """Values of a site's components, inside the support that its law has at these values.
+    """Values of a site's components, inside the support that its distribution has at these values.
 
     spread : (POINTS,) the size of those that can be any number; others are near their bounds, too.
     """

@@ -63,8 +63,8 @@ class Search:
         return out
 
     def unread(self, components: Iterable[Expr]) -> list[str] | None:
-        """None where some law reads one of these components; else the parameters that their own
-        prior depends on."""
+        """None where some distribution reads one of these components; else the parameters that
+        their own prior depends on."""
         block, trace = frozenset(components), self.data.trace
         for group in (trace.parameters, trace.initial, trace.transition, trace.observations):
             if any(block & _read_by(site) for site in group.values()):
@@ -310,5 +310,5 @@ def bounds_of(site: Site) -> dict[Expr, tuple[Expr, Expr]]:
 
 
 def _read_by(site: Site) -> frozenset[Expr]:
-    """The symbols in the arguments of a law."""
+    """The symbols in the arguments of a distribution."""
     return symbols_of(e for p in site.distribution.parameters.values() for e in p.ravel())

@@ -86,8 +86,8 @@ class BlockForm:
     functions : the s_i; `monomials` holds them as products of powers.
     coefficients : role -> the summands of C_i, aligned with `functions`.
     origins : monomial -> the terms it comes from.
-    inseparable : terms of the prior and the initial law that do not separate, and why; they are
-        missing in the sum. Empty unless it was asked for.
+    inseparable : terms of the prior and the initial distribution that do not separate, and why;
+        they are missing in the sum. Empty unless it was asked for.
     """
 
     components: tuple[Expr, ...]

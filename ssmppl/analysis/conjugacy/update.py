@@ -26,8 +26,8 @@ class Update:
     bounds : (lower, upper) of each component, expressions of other parameters.
     needs_log_joint : not separable, so each evaluation takes the whole log joint density; where a
         deterministic state depends on the block, that of the noisy states and the observations.
-    inseparable_terms : those of the prior or the initial law that the statistics do not hold; the
-        log joint density corrects for them.
+    inseparable_terms : those of the prior or the initial distribution that the statistics do not
+        hold; the log joint density corrects for them.
     reason, where : why nothing better applies, and the user's line.
     """
 

@@ -1,1 +1,1 @@
-"""What is integrated out: linear Gaussian states, and parameters with conjugate laws."""
+"""What is integrated out: linear Gaussian states, and parameters with conjugate distributions."""

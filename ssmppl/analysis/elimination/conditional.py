@@ -1,10 +1,10 @@
 """Models that are linear and Gaussian given some of their states.
 
-The states are split in two: z, whose laws are Gaussian (or deterministic) with means affine in
-z_{t-1} and spreads free of it, and the others, x, of which coefficients, spreads, and laws that
-are not Gaussian may depend as they like. Given the whole path of x, z is a linear Gaussian model
-with known coefficients, and the Kalman filter integrates it out (Doucet, de Freitas, Murphy and
-Russell 2000; Schön, Gustafsson and Nordlund 2005, model 18).
+The states are split in two: z, whose distributions are Gaussian (or deterministic) with means
+affine in z_{t-1} and spreads free of it, and the others, x, of which coefficients, spreads, and
+distributions that are not Gaussian may depend as they like. Given the whole path of x, z is a
+linear Gaussian model with known coefficients, and the Kalman filter integrates it out (Doucet, de
+Freitas, Murphy and Russell 2000; Schön, Gustafsson and Nordlund 2005, model 18).
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ def conditionally_linear(trace: Trace) -> ConditionallyLinear | NotApplicable:
 
 
 def gaussian(site: Site) -> bool:
-    """Whether a law has a mean and a covariance and nothing else; Dirac's is zero."""
+    """Whether a distribution has a mean and a covariance and nothing else; Dirac's is zero."""
     return isinstance(site.distribution, (Normal, MvNormal, Dirac))
 
 
 def _laws(trace: Trace) -> Iterable[tuple[Site, dict[Expr, Expr]]]:
-    """Every law that may depend on states, and the states behind its symbols: of a transition those
-    before and new values of others."""
+    """Every distribution that may depend on states, and the states behind its symbols: of a
+    transition those before and new values of others."""
     prev = {previous(s): s for s in trace.state_symbols}
     own = {s: s for s in trace.state_symbols}
     for site in trace.transition.values():

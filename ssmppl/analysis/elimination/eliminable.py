@@ -1,7 +1,7 @@
 """Which parameters can be integrated out of conditional SMC: what `elimination.py` goes by.
 
-Only what is exact: a family that holds every term of the block, the initial law included, and no
-truncation. Blocks are eliminated together if no term of the density holds two of them.
+Only what is exact: a family that holds every term of the block, the initial distribution included,
+and no truncation. Blocks are eliminated together if no term of the density holds two of them.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ Z the family's normalising constant and r_k the rest of the densities of row k, 
 That is no Markov model in x. It is one in x with the running sums S_t = sum_{k <= t} c_k, which
 follow from x as deterministic components do, and so conditional SMC runs on (x, S):
 
-    draw x_t       by the transition, with the block drawn from its law given S_{t-1}
+    draw x_t       by the transition, with the block drawn from its distribution given S_{t-1}
     weigh x_t      by Z(B_t + S_t) / Z(B_{t-1} + S_{t-1} + transition's part of c_t), times r
     join x'_t      the reference with ancestor i: by Z(W_t + S'_t) / Z(B_{t-1} + S_{t-1}), times r,
                    S' the statistics as far as the ancestor bears on them and W all the others
@@ -140,7 +140,7 @@ class _Build:
     # -- statistics and what they are worth
     def _sums(self, *roles: str) -> list[Expr]:
         """The carried statistics with the increments of these roles; of the first row alone
-        where the initial law is among them."""
+        where the initial distribution is among them."""
         out = []
         for k in self.carried:
             total = ZERO if roles[0] == "initial" else previous(self.sums[k])

@@ -61,9 +61,9 @@ class Marginal:
 
     trace : of x and the predicted moments. mean (n,), covariance (n, n) : the symbols of m_t, P_t.
     filtered_mean, filtered_covariance : of z_t given y_t too, in symbols of step t.
-    given : the law of (coupled x, z) given the path of x, as a linear Gaussian model whose
+    given : the distribution of (coupled x, z) given the path of x, as a linear Gaussian model whose
         observations are the channels, then the coupled x without noise.
-    channels : components of y that tell of z, with those that share a law with them.
+    channels : components of y that tell of z, with those that share a distribution with them.
     """
 
     split: ConditionallyLinear
@@ -134,7 +134,7 @@ class _Build:
 
     # -- the observation: y_t given x_t, m_t, P_t
     def _observe(self) -> tuple[GaussianMoments, dict[str, Site]]:
-        """What is known of z_t after y_t, and the laws of the channels."""
+        """What is known of z_t after y_t, and the distributions of the channels."""
         telling, z = self._telling(), list(self.split.linear)
         moments = GaussianMoments(objects(self.mean), self.covariance)
         before = moments
@@ -160,7 +160,7 @@ class _Build:
     def _sites(
         self, sites: Mapping[str, Site], filtered: GaussianMoments | None
     ) -> dict[str, Site]:
-        """The laws of x, then of the moments; `filtered` is None for the first row."""
+        """The distributions of x, then of the moments; `filtered` is None for the first row."""
         joint, coupled = self._joint(sites, filtered)
         given = joint.given_exactly(coupled)
         found: dict[str, Site] = {}
@@ -195,7 +195,7 @@ class _Build:
     def _joint(
         self, sites: Mapping[str, Site], filtered: GaussianMoments | None
     ) -> tuple[GaussianMoments, list[Expr]]:
-        """The law of (coupled x, z) given the past, and which x these are."""
+        """The distribution of (coupled x, z) given the past, and which x these are."""
         if filtered is None:
             coupled = correlated(sites.values(), self.linear)
             order = [*(s for s in self.trace.state_symbols if s in coupled), *self.split.linear]
@@ -267,7 +267,8 @@ def _block(sites: Mapping[str, Site], order: Sequence[Expr]) -> GaussianBlock:
 
 
 def _law(sites: Mapping[str, Site], order: Sequence[Expr]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of components with Gaussian or deterministic laws, in this order."""
+    """Mean and covariance of components with Gaussian or deterministic distributions, in this
+    order."""
     block = _block(sites, order)
     place = {s: i for i, s in enumerate(block.symbols)}
     index = [place[s] for s in order]
@@ -290,7 +291,7 @@ def _affine(site: Site, z: Sequence[Expr]) -> tuple[np.ndarray, np.ndarray, np.n
 def _observed(
     laws: Sequence[tuple[Expr, Expr]], alone: Sequence[tuple[Expr, Expr]], site: Site, single: bool
 ) -> Distribution:
-    """The law of a site's channels, of the site's shape."""
+    """The distribution of a site's channels, of the site's shape."""
 
     def shaped(pairs: Sequence[tuple[Expr, Expr]], which: int) -> ExprArray:
         return array(objects([p[which] for p in pairs]).reshape(site.shape))

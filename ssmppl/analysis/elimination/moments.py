@@ -20,7 +20,7 @@ ZERO = constant(0.0)
 
 @dataclass(frozen=True)
 class GaussianMoments:
-    """A Gaussian law of z: mean (n,), covariance (n, n), as arrays of Exprs."""
+    """A Gaussian distribution of z: mean (n,), covariance (n, n), as arrays of Exprs."""
 
     mean: np.ndarray
     covariance: np.ndarray

@@ -1,4 +1,4 @@
-"""The laws of single components of an observation, which predictions are made by."""
+"""The distributions of single components of an observation, which predictions are made by."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from ssmppl.language.model.trace import Site, Trace
 @dataclass(frozen=True)
 class Channel:
     """One component given x_t. below : P(Y <= y), of its own symbol y. ends : values, of a level,
-    between which its inverse lies; of most laws that itself. whole : whether its values are whole
-    numbers."""
+    between which its inverse lies; of most distributions that itself. whole : whether its values
+    are whole numbers."""
 
     below: Expr
     ends: Callable[[float], list[Expr]]
@@ -35,7 +35,8 @@ class Channel:
 
 
 def channels(site: Site) -> list[Channel | None]:
-    """Of every component; None where its law has no distribution function, or no inverse of it."""
+    """Of every component; None where its distribution has no distribution function, or no inverse
+    of it."""
     law, y = of_components(site.distribution), site.value
     parts = _parts(law)
     if law.multivariate or not all(part.inverts() for part in parts):
@@ -52,7 +53,7 @@ def channels(site: Site) -> list[Channel | None]:
 
 
 def _parts(law: Distribution) -> list[Distribution]:
-    """The laws that a law is a mixture of: its quantiles lie between theirs."""
+    """The distributions that a distribution is a mixture of: its quantiles lie between theirs."""
     if isinstance(law, Mixture):
         return [part for component in law.components for part in _parts(component)]
     if isinstance(law, ZeroInflated) and isinstance(law.base, Mixture):
@@ -67,8 +68,9 @@ def _at(values: ExprArray, site: Site, place: int) -> Expr:
 
 
 def channel_draws(trace: Trace) -> list[Expr]:
-    """A draw of every component of y_t given x_t, in the trace's order, by its own law: those of
-    one that is jointly Gaussian are independent, which takes no factor of its covariance."""
+    """A draw of every component of y_t given x_t, in the trace's order, by its own distribution:
+    those of one that is jointly Gaussian are independent, which takes no factor of its
+    covariance."""
     sites = [replace(s, distribution=alone(s.distribution)) for s in trace.observations.values()]
     return observation_draws(replace(trace, observations={s.name: s for s in sites}))
 
@@ -85,7 +87,7 @@ def observation_draws(trace: Trace) -> list[Expr]:
 
 
 def alone(law: Distribution) -> Distribution:
-    """The laws of the components of one that is jointly Gaussian; any other as it is."""
+    """The distributions of the components of one that is jointly Gaussian; any other as it is."""
     if not isinstance(law, (MvNormal, SequentialNormal)):
         return law
     found = Normal(law.mean(), variance=law.variance())
@@ -94,12 +96,12 @@ def alone(law: Distribution) -> Distribution:
 
 
 def of_components(law: Distribution) -> Distribution:
-    """The law of each component alone, of a law that has them in closed form; any other as it
-    is."""
+    """The distribution of each component alone, of a distribution that has them in closed form; any
+    other as it is."""
     return _shares(law) if isinstance(law, Dirichlet) else alone(law)
 
 
 def _shares(law: Dirichlet) -> Beta:
-    """The laws of single shares."""
+    """The distributions of single shares."""
     a = law.concentration
     return Beta(a, array(np.sum(a.view(np.ndarray), axis=-1, keepdims=True) - a.view(np.ndarray)))

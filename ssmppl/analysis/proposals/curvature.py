@@ -24,8 +24,8 @@ from ssmppl.language.model.trace import Trace
 
 @dataclass(frozen=True)
 class Bend:
-    """Derivatives of a law by noise: dF / d(before, e) by rows of F, first all of `before`, then
-    all of e; then the lower half of the second derivatives of l' F in (before, e).
+    """Derivatives of a distribution by noise: dF / d(before, e) by rows of F, first all of
+    `before`, then all of e; then the lower half of the second derivatives of l' F in (before, e).
 
     given : the symbols of e (R,), then those of l (D,).
     """
@@ -54,7 +54,7 @@ def bend_of(form: NoiseForm, before: list[Expr]) -> Bend | NotApplicable:
 
 
 def bends(found: LookaheadModel, trace: Trace) -> tuple[Bend, Bend] | NotApplicable:
-    """Of the initial law and of the transition."""
+    """Of the initial distribution and of the transition."""
     first, later = bend_of(found.initial, []), bend_of(found.transition, trace.state_prev_symbols)
     for one in (first, later):
         if isinstance(one, NotApplicable):
@@ -75,7 +75,7 @@ def laplace_obstacle(trace: Trace, missing: Missing) -> NotApplicable | None:
 
 @dataclass(frozen=True)
 class Adjoint:
-    """Gradients of what a law by noise adds to Laplace's log-likelihood; see
+    """Gradients of what a distribution by noise adds to Laplace's log-likelihood; see
     `codegen/kernels/gaussian/mode_gradient.py`.
 
     With z = (x_{t-1}, e), D = dF / dz and S the second derivatives of l' F in z,
@@ -84,8 +84,8 @@ class Adjoint:
         Psi = Phi + a' F + l' D v.
 
     given : symbols of e (R,), l (D,), W (D, Z) by rows, Xi (Z, Z) its lower half by rows, a (D,), v
-    (Z,). moving : gradient of Phi in x_{t-1} (none of the initial law), e and l. fixed : of Psi in
-    theta.
+    (Z,). moving : gradient of Phi in x_{t-1} (none of the initial distribution), e and l. fixed :
+    of Psi in theta.
     """
 
     given: tuple[Expr, ...]

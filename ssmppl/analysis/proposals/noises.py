@@ -1,11 +1,12 @@
 """The states of a model by their noises: x_1 = F_1(e_1; theta), x_t = F(x_{t-1}, e_t; theta).
 
-With a law of location and scale, x = m + S e, the noise e has a law that is free of the parameters
-in m and S: the state is non-centred. A move of theta that holds the noises fixed takes the
-trajectory along (Papaspiliopoulos, Roberts and Sköld 2007, "A general framework for the
-parametrization of hierarchical models", *Statistical Science* 22). Nothing is asked of the law of e
-itself: the Jacobian of x in e is all that such a move needs, so a Student t may even have its
-degrees of freedom moved. States of other laws stay centred, deterministic ones follow.
+With a distribution of location and scale, x = m + S e, the noise e has a distribution that is free
+of the parameters in m and S: the state is non-centred. A move of theta that holds the noises fixed
+takes the trajectory along (Papaspiliopoulos, Roberts and Sköld 2007, "A general framework for the
+parametrization of hierarchical models", *Statistical Science* 22). Nothing is asked of the
+distribution of e itself: the Jacobian of x in e is all that such a move needs, so a Student t may
+even have its degrees of freedom moved. States of other distributions stay centred, deterministic
+ones follow.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from ssmppl.language.model.trace import Site, Trace
 
 @dataclass(frozen=True)
 class NonCentred:
-    """A law by its noise.
+    """A distribution by its noise.
 
     noise : symbols of e (R,). value : F by component, in the order of the trace's states, as a
     function of x_{t-1} and e; a centred state is its own symbol. recovered : (R,) e as a function
@@ -54,7 +55,8 @@ class NonCentred:
 
 @dataclass(frozen=True)
 class Noises:
-    """Both laws of a model by noise; parameters : names of those that move the states with them.
+    """Both distributions of a model by noise; parameters : names of those that move the states with
+    them.
 
     tied : names of all parameters that stand in a factor with a state. lookahead : what a Gaussian
     approximation to the states' posterior can be found from, or why there is none.
@@ -99,7 +101,7 @@ def noises(trace: Trace, missing: Missing) -> Noises | NotApplicable:
 
 
 def non_centred(sites: Sequence[Site], states: Sequence[Expr]) -> NonCentred:
-    """The laws of one role by their noises."""
+    """The distributions of one role by their noises."""
     value: dict[Expr, Expr] = {}
     noise: list[Expr] = []
     recovered: list[Expr] = []
@@ -127,7 +129,8 @@ def non_centred(sites: Sequence[Site], states: Sequence[Expr]) -> NonCentred:
 
 
 def _by_noise(site: Site, noise: list[Expr]) -> tuple[ExprArray, ExprArray] | None:
-    """(x as a function of e, e as a function of x), None where the law is not of that kind."""
+    """(x as a function of e, e as a function of x), None where the distribution is not of that
+    kind."""
     d: Any = site.distribution
     x = site.value
     if d.gaussian_noise:

@@ -36,7 +36,8 @@ class Perturbed:
     proposal : how particles move and what they weigh; initial draws read z_0 from the previous
     states.
     moving : (F,) whether a number acts at more than the first row of an experiment. Those that do
-    not act in the initial law only, or only in the prior. acting : (F,) whether it acts at all.
+    not act in the initial distribution only, or only in the prior. acting : (F,) whether it acts at
+        all.
     """
 
     trace: Trace

@@ -157,8 +157,8 @@ def bootstrap(trace: Trace, missing: Missing) -> Proposal:
 
 
 def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
-    """A draw from the law of every component, which may name others of the same step; NaN where a
-    parameter of the law is out of its range."""
+    """A draw from the distribution of every component, which may name others of the same step; NaN
+    where a parameter of the distribution is out of its range."""
     out: dict[Expr, Expr] = {}
     for site in sites:
         law = site.distribution
@@ -169,10 +169,10 @@ def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
 
 
 def drawn(site: Site, draws: Draws | None = None) -> ExprArray:
-    """A draw from a law, of its shape; NaN where a parameter is out of its range.
+    """A draw from a distribution, of its shape; NaN where a parameter is out of its range.
 
-    Of a flat law, and of an observation's without a sampler, NaN, for code that is never run: no
-    algorithm starts from the one, and what would draw the other refuses.
+    Of a flat distribution, and of an observation's without a sampler, NaN, for code that is never
+    run: no algorithm starts from the one, and what would draw the other refuses.
 
     draws : the random numbers that it is made of; None: its own.
     """
@@ -186,7 +186,7 @@ def drawn(site: Site, draws: Draws | None = None) -> ExprArray:
 
 @dataclass(frozen=True)
 class Split:
-    """The states of one law: Gaussian ones, and the others with their draws.
+    """The states of one distribution: Gaussian ones, and the others with their draws.
 
     others : as functions of the past, and of new values of the Gaussian ones. random : whether some
     of them is random. following : those of them that are functions of the Gaussian ones of the same
@@ -212,7 +212,7 @@ class Split:
 
 
 def split(trace: Trace, sites: list[Site]) -> Split:
-    """The initial law or the transition, taken apart.
+    """The initial distribution or the transition, taken apart.
 
     A Gaussian state that reads new values of others in another way than by an affine mean is
     Gaussian given these: where it is observed they are drawn first, else it is drawn last.

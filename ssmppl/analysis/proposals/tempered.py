@@ -1,9 +1,10 @@
 """Which states the tempered particle filter can move by themselves.
 
-Between two temperatures particles take random-walk steps in x_t that leave the law of density
-proportional to f(x_t | x_{t-1}) g(y_t | x_t)^temperature invariant. That needs a density of x_t,
-and room to move: components of a continuous law have both. The others stay where the transition put
-them, deterministic ones too, as long as they follow from no state that moves in the same step.
+Between two temperatures particles take random-walk steps in x_t that leave the distribution of
+density proportional to f(x_t | x_{t-1}) g(y_t | x_t)^temperature invariant. That needs a density of
+x_t, and room to move: components of a continuous distribution have both. The others stay where the
+transition put them, deterministic ones too, as long as they follow from no state that moves in the
+same step.
 """
 
 from __future__ import annotations

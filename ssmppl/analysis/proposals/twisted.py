@@ -12,9 +12,10 @@ approximation to the whole smoothing problem (`codegen/kernels/twisted/lookahead
 velocity is drawn by the positions that follow it, where a look at y_t alone says nothing.
 
 All is done on standard normal noise e with x_t = F(x_{t-1}, e), F affine in e about e = 0: with
-f = F(x_{t-1}, 0) and L = dF / de, e is Gaussian of precision I + L' A L under the twisted law. So
-states that follow without noise of their own need no density, and a singular covariance is no
-trouble. A small share of the particles is drawn from the transition, which bounds the weights.
+f = F(x_{t-1}, 0) and L = dF / de, e is Gaussian of precision I + L' A L under the twisted
+distribution. So states that follow without noise of their own need no density, and a singular
+covariance is no trouble. A small share of the particles is drawn from the transition, which bounds
+the weights.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ WRITTEN_OUT = 6
 
 @dataclass(frozen=True)
 class NoiseForm:
-    """A law as x = F(e), e standard normal.
+    """A distribution as x = F(e), e standard normal.
 
     noise : symbols of e (R,). value : F by component, in the order of the trace's states.
     recovered : (R,) e as a function of x and x_{t-1}.
@@ -96,7 +97,8 @@ class NoiseForm:
 class LookaheadModel:
     """What the lookahead pass, which finds the twisting function, needs to know of a model.
 
-    initial, transition : its laws by noise. observed : log g(y_t | x_t), 0 where nothing was seen.
+    initial, transition : its distributions by noise. observed : log g(y_t | x_t), 0 where nothing
+        was seen.
     slope (D,), curvature (D, D) : of it, the latter with the sign changed. flat : whether the
     curvature is the same wherever the states are.
     """
@@ -115,7 +117,8 @@ class LookaheadModel:
 
 
 def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicable:
-    """A law by the noise that drives it; NotApplicable where some state's is not of that kind."""
+    """A distribution by the noise that drives it; NotApplicable where some state's is not of that
+    kind."""
     value: dict[Expr, Expr] = {}
     noise: list[Expr] = []
     recovered: list[Expr] = []
@@ -212,8 +215,8 @@ def twisting_symbols(d: int) -> tuple[ExprArray, ExprArray, ExprArray]:
 
 
 def start_symbols(r: int) -> tuple[ExprArray, ExprArray]:
-    """Mean (R,) of the noise of x_1 under the twisted law, and the lower factor (R, R) of its
-    precision."""
+    """Mean (R,) of the noise of x_1 under the twisted distribution, and the lower factor (R, R) of
+    its precision."""
     factor = np.full((r, r), constant(0.0), dtype=object)
     for i in range(r):
         for j in range(i + 1):
@@ -234,7 +237,8 @@ UNSUITED = "these filters do not compute the guide of the twisted proposal"
 
 
 def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
-    """The proposal in the twisting function's symbols; its laws where they are written out."""
+    """The proposal in the twisting function's symbols; its distributions where they are written
+    out."""
     found = lookahead_model(trace, missing)
     if isinstance(found, NotApplicable):
         return found
@@ -277,14 +281,15 @@ class _Law:
 
 
 def _initial_law(form: NoiseForm, states: list[Expr]) -> _Law:
-    """x_1 under the twisted law, which the kernel has worked out: it depends on no particle."""
+    """x_1 under the twisted distribution, which the kernel has worked out: it depends on no
+    particle."""
     mean, factor = start_symbols(len(form.noise))
     root = lower_inverse(factor) if form.noise else factor
     return _twisted_law(form, states, mean, factor, root, constant(0.0))
 
 
 def _transition_law(form: NoiseForm, states: list[Expr]) -> _Law:
-    """x_t under the twisted law, given x_{t-1}."""
+    """x_t under the twisted distribution, given x_{t-1}."""
     r = len(form.noise)
     precision, pull, centre = twisting_symbols(len(states))
     away = array(form.at_rest() - centre)
@@ -302,7 +307,8 @@ def _twisted_law(
     form: NoiseForm, states: list[Expr], mean: ExprArray, factor: ExprArray, root: ExprArray,
     ahead: Expr,
 ) -> _Law:  # fmt: skip
-    """A law whose noise has this mean (R,) and, as factor of its precision, the lower `factor`."""
+    """A distribution whose noise has this mean (R,) and, as factor of its precision, the lower
+    `factor`."""
     r = len(form.noise)
     if r == 0:
         return _Law(dict(zip(states, form.value, strict=True)), constant(0.0), ahead, ())

@@ -1,9 +1,9 @@
 """Upper bounds of the transition density of a given x_t over all x_{t-1}.
 
 What rejection sampling of backward indices needs (Douc, Garivier, Moulines and Olsson 2011): for
-each law, the density with those parameters that depend on x_{t-1} at the values that maximise it.
-A location goes to the value itself, a rate or a mean to its maximum likelihood estimate from one
-value. The result is free of x_{t-1}, and no smaller than the density anywhere.
+each distribution, the density with those parameters that depend on x_{t-1} at the values that
+maximise it. A location goes to the value itself, a rate or a mean to its maximum likelihood
+estimate from one value. The result is free of x_{t-1}, and no smaller than the density anywhere.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApp
 
 
 def _zero_inflated(site: Site, d: laws.ZeroInflated, prev: Sequence[Expr]) -> Expr | NotApplicable:
-    """At most 1 at zero; elsewhere that of the law inside, times 1 - p where p is free of the
-    state."""
+    """At most 1 at zero; elsewhere that of the distribution inside, times 1 - p where p is free of
+    the state."""
     total = constant(0.0)
     for i in np.ndindex(site.shape):
         part = _upper_bound(_element(site, d.base, i), prev)

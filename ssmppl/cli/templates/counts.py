@@ -17,7 +17,7 @@ model = ssm.Model("NAME")
 
 
 # What is known of the parameters before the data are seen. The names of the arguments below say
-# what each law depends on: parameters, states, and t, the number of the row.
+# what each distribution depends on: parameters, states, and t, the number of the row.
 @model.prior
 def prior():
     return {
@@ -27,7 +27,7 @@ def prior():
     }
 
 
-# The state at the first row: here the law that the transition keeps.
+# The state at the first row: here the distribution that the transition keeps.
 @model.initial
 def initial(phi, q):
     return {"x": ssm.Normal(0, variance=q / (1 - phi**2))}

@@ -16,7 +16,7 @@ model = ssm.Model("NAME", inputs=("u",))
 
 
 # What is known of the parameters before the data are seen. The names of the arguments below say
-# what each law depends on: parameters, states, inputs, and t, the number of the row.
+# what each distribution depends on: parameters, states, inputs, and t, the number of the row.
 @model.prior
 def prior():
     return {

@@ -15,7 +15,7 @@ model = ssm.Model("NAME")
 
 
 # What is known of the parameters before the data are seen. The names of the arguments below say
-# what each law depends on: parameters, states, and t, the number of the row.
+# what each distribution depends on: parameters, states, and t, the number of the row.
 @model.prior
 def prior():
     return {

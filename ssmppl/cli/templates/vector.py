@@ -21,7 +21,7 @@ Q = np.array([[STEP**3 / 3, STEP**2 / 2], [STEP**2 / 2, STEP]])  # of a velocity
 
 
 # What is known of the parameters before the data are seen. The names of the arguments below say
-# what each law depends on: parameters, states, and t, the number of the row.
+# what each distribution depends on: parameters, states, and t, the number of the row.
 @model.prior
 def prior():
     return {

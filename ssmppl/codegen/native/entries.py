@@ -177,7 +177,7 @@ def entry(
 class ByAddress:
     """A compiled algorithm for one model: called with theta and all that follows.
 
-    run : the algorithm. constants : what it takes before theta. addresses : of the model's functions.
+    run : the algorithm. constants : what it takes before theta. addresses : of its functions.
     """
 
     def __init__(

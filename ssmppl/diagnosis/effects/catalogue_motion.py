@@ -2,8 +2,8 @@
 
 Each function is the increment of the equation of its first argument; l is the strength, v a state
 whose own motion it is (a velocity, a level, a temperature), x the state that integrates it or v
-itself. The friction laws as in Armstrong-Hélouvry, Dupont and Canudas de Wit (1994), *Automatica*
-30; hysteresis as in Bouc (1967) and Wen (1976), *J. Eng. Mech. Div.* 102.
+itself. The friction distributions as in Armstrong-Hélouvry, Dupont and Canudas de Wit (1994),
+*Automatica* 30; hysteresis as in Bouc (1967) and Wen (1976), *J. Eng. Mech. Div.* 102.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Effects in the sensors, in the noise laws, and in where the system starts.
+"""Effects in the sensors, in the noise distributions, and in where the system starts.
 
-Each function of a sensor is the increment of the noise-free value h of its channel, of a noise law
-that of the log variance; l is the strength.
+Each function of a sensor is the increment of the noise-free value h of its channel, of a noise
+distribution that of the log variance; l is the strength.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def quantisation(h, strength, d):
 # -- noise laws, of states and channels
 @effect(on="any", kind="tail", name="outliers", lower=0, upper=0.5)
 def outliers(h, strength):
-    """Student's t with 1 / df = l in place of the normal law"""
+    """Student's t with 1 / df = l in place of the normal distribution"""
     return strength
 
 

@@ -11,19 +11,20 @@ kind           bound to           what the function returns
                                   states: ``{"x": -over, "other": over}``
 "observation"  channel            increment of the observation's mean; first argument: that mean
 "input"        input              the input that acts in its place (itself at strength 0)
-"noise"        state or channel   increment of the log variance of its law
-"tail"         state or channel   1 / df of Student's t in place of the normal law
+"noise"        state or channel   increment of the log variance of its distribution
+"tail"         state or channel   1 / df of Student's t in place of the normal distribution
 "parameter"    parameter          its value at row t (itself at strength 0)
 "initial"      state              shift of the mean of x_1
 "state"        any but "initial"  an `Auxiliary`: what the kind of its equation returns (a state:
-                                  "transition", a channel: "observation", ...), with the laws of
-                                  further states
+                                  "transition", a channel: "observation", ...), with the
+                                  distributions of further states
 =============  =================  ================================================================
 
-Increments act on the mean of Normal, MvNormal, StudentT, Laplace, Cauchy and Dirac laws, on the
-mean of the log of LogNormal, on the log of the mean of Poisson, NegativeBinomial, Gamma,
-Exponential and Weibull and on the logit of that of Bernoulli and Binomial laws; of the law inside
-Truncated and ZeroInflated. Other laws have no mean that an effect could move.
+Increments act on the mean of Normal, MvNormal, StudentT, Laplace, Cauchy and Dirac distributions,
+on the mean of the log of LogNormal, on the log of the mean of Poisson, NegativeBinomial, Gamma,
+Exponential and Weibull and on the logit of that of Bernoulli and Binomial distributions; of the
+distribution inside Truncated and ZeroInflated. Other distributions have no mean that an effect
+could move.
 
 ==================  ===========================================================================
 `on`                which equations it is offered for
@@ -165,8 +166,8 @@ class Auxiliary:
     """Returned by an effect of kind "state".
 
     change : what the effect does to its equation, from the auxiliary states among the arguments.
-    transition, initial : by auxiliary state, its law given the step before, and of x_1; the latter
-        may depend on parameters and inputs only.
+    transition, initial : by auxiliary state, its distribution given the step before, and of x_1;
+        the latter may depend on parameters and inputs only.
     """
 
     change: Any

@@ -2,8 +2,9 @@
 
 Inputs and parameters are replaced first, in transitions and observations; means, variances, tails
 and starts are changed after that. Several effects on one equation add up. Auxiliary states join the
-model's own; those with the same laws are shared. Each effect is bound to the model as it was, not
-to what others make of it: one after the other they are the same as all at once (`equations.py`).
+model's own; those with the same distributions are shared. Each effect is bound to the model as it
+was, not to what others make of it: one after the other they are the same as all at once
+(`equations.py`).
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ def _check(candidates: Sequence[Candidate], trace: Trace, equations: Equations) 
 
 
 def _check_law(c: Candidate, equations: Equations) -> None:
-    """Check that the law can be changed so."""
+    """Check that the distribution can be changed so."""
     found: Any = None
     part = equations.parts[c.equation]
     if c.change in ("transition", "observation", "initial"):
@@ -184,7 +185,8 @@ class _Auxiliary:
     def add(
         self, c: Candidate, equations: Equations, locations: dict[Expr, Location]
     ) -> dict[str, str]:
-        """The names of a candidate's states: those of an earlier one where their laws agree."""
+        """The names of a candidate's states: those of an earlier one where their distributions
+        agree."""
         if not c.effect.states or c.held:
             return {}
         for number in itertools.count(1):
@@ -306,7 +308,7 @@ def _pushes(
 
 
 def _role(c: Candidate, part: Part) -> str:
-    """Whose law a change belongs to."""
+    """Whose distribution a change belongs to."""
     if c.change in ("noise", "tail"):
         return "transition" if part.role == "state" else "observation"
     return c.change

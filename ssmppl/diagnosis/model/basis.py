@@ -71,7 +71,7 @@ def bases(x: Any, count: int = 6) -> tuple[Smooth, ...]:
     Parameters
     ----------
     x : values (any shape; NaN left out), or (centre, sd) as a tuple of two numbers: the functions
-        are then orthonormal under a normal law.
+        are then orthonormal under a normal distribution.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def _with_it(term: BasisTerm, moved: Mapping[str, Reaction]) -> BasisTerm:
 
 
 def _measured(law: Distribution, states: Sequence[Part]) -> list[Part]:
-    """The states that a channel's law depends on; all of them where it depends on none."""
+    """The states that a channel's distribution depends on; all of them where it depends on none."""
     inside = symbols_of([e for p in law.parameters.values() for e in array(p).ravel()])
     return [s for s in states if s.seen_from("observation") in inside] or list(states)
 

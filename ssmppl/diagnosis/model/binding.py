@@ -27,10 +27,10 @@ _WITHOUT_STATES = ("parameter", "input", "time")  # what an initial law may depe
 
 @dataclass
 class Bound:
-    """The changes that a candidate makes to one law of the model.
+    """The changes that a candidate makes to one distribution of the model.
 
     changes : label of the part -> increment, or value in its place.
-    transition, initial : laws of its auxiliary states, by name in the model.
+    transition, initial : distributions of its auxiliary states, by name in the model.
     """
 
     changes: dict[str, Expr] = field(default_factory=dict)
@@ -42,7 +42,7 @@ def bind(
     candidate: Candidate, equations: Equations, role: str, names: Mapping[str, str] | None = None,
     *, own: bool = False,
 ) -> Bound:  # fmt: skip
-    """Call the effect's function as part of a law.
+    """Call the effect's function as part of a distribution.
 
     Parameters
     ----------
@@ -179,7 +179,8 @@ def unknown(effect: Effect, name: str, equations: Equations) -> ModelError:
 
 
 def quantity(equations: Equations, name: str, role: str) -> Any:
-    """A quantity of the model seen from a law; None where it has none of that name there."""
+    """A quantity of the model seen from a distribution; None where it has none of that name
+    there."""
     parts = [p for p in equations.parts.values() if p.name == name]
     if not parts or (parts[0].role == "channel" and role != "transition"):
         return None

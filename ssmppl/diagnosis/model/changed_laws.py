@@ -1,7 +1,8 @@
-"""Laws changed: their symbols replaced, their means moved, variances scaled, tails made heavier.
+"""Distributions changed: their symbols replaced, their means moved, variances scaled, tails made
+heavier.
 
-Every change keeps the law's place in the user's file, and gives the law itself back, expression by
-expression, where the change is 0 (tails: to rounding and `NORMAL`).
+Every change keeps the distribution's place in the user's file, and gives the distribution itself
+back, expression by expression, where the change is 0 (tails: to rounding and `NORMAL`).
 """
 
 from __future__ import annotations
@@ -37,19 +38,20 @@ NORMAL = 1e-5
 
 
 def rebuilt(d: Distribution, parameters: Mapping[str, Any]) -> Distribution:
-    """A law of the same family with these parameters for its own, of a truncated or zero-inflated
-    one for those of the law inside."""
+    """A distribution of the same family with these parameters for its own, of a truncated or
+    zero-inflated one for those of the distribution inside."""
     inside = isinstance(d, (Truncated, ZeroInflated))
     return d.rebuilt({f"like_{k}" if inside else k: v for k, v in parameters.items()})
 
 
 def _inner(d: Distribution) -> Distribution:
-    """The law inside a truncated or zero-inflated one."""
+    """The distribution inside a truncated or zero-inflated one."""
     return d.base if isinstance(d, (Truncated, ZeroInflated)) else d
 
 
 def substituted(d: Distribution, replacement: Mapping[Expr, Expr]) -> Distribution:
-    """The law with symbols replaced; the law itself where it holds none of them."""
+    """The distribution with symbols replaced; the distribution itself where it holds none of
+    them."""
     own = d.parameters
     names, nodes = list(own), [e for a in own.values() for e in a.ravel()]
     new = substitute(nodes, dict(replacement))
@@ -82,7 +84,7 @@ def noise_free(d: Distribution, index: Index) -> Expr:
 
 
 def shifted(d: Distribution, changes: Changes) -> Distribution:
-    """The law with means at these indices moved, on the scale of `scale_of_mean`."""
+    """The distribution with means at these indices moved, on the scale of `scale_of_mean`."""
     inner = _inner(d)
     link = inner.mean_link
     assert link is not None
@@ -109,7 +111,7 @@ def _changed(d: Distribution, values: ExprArray, changes: Changes, change: Any) 
 
 # -- variances
 def has_scale(d: Distribution) -> NotApplicable | None:
-    """Why the law has no variance of its own that could be scaled; None where it has."""
+    """Why the distribution has no variance of its own that could be scaled; None where it has."""
     inner = _inner(d)
     if inner.variance_link is not None:
         return None
@@ -123,7 +125,7 @@ def has_scale(d: Distribution) -> NotApplicable | None:
 
 
 def scaled(d: Distribution, changes: Changes) -> Distribution:
-    """The law with increments of the log variance of the components at these indices."""
+    """The distribution with increments of the log variance of the components at these indices."""
     inner = _inner(d)
     assert inner.variance_link is not None
     name, power = inner.variance_link.parameter, inner.variance_link.power
@@ -142,7 +144,7 @@ def scaled(d: Distribution, changes: Changes) -> Distribution:
 
 # -- tails
 def has_tail(d: Distribution) -> NotApplicable | None:
-    """Why Student's t cannot stand for the law; None where it can."""
+    """Why Student's t cannot stand for the distribution; None where it can."""
     inner = _inner(d)
     if isinstance(inner, Normal):
         return None
@@ -153,7 +155,8 @@ def has_tail(d: Distribution) -> NotApplicable | None:
 
 
 def heavier(d: Distribution, changes: Changes) -> Distribution:
-    """Student's t with 1 / df = `NORMAL` + the changes at these indices, for a normal law."""
+    """Student's t with 1 / df = `NORMAL` + the changes at these indices, for a normal
+    distribution."""
     inner = _inner(d)
     if isinstance(inner, StudentT):  # a second effect of the kind
         inverse = _changed(d, inner.df, changes, lambda df, by: 1.0 / df + by)

@@ -87,7 +87,7 @@ class Part:
     symbol: Expr
 
     def seen_from(self, role: str) -> Expr:
-        """Its symbol in a transition (of the step before) or in another law."""
+        """Its symbol in a transition (of the step before) or in another distribution."""
         lagging = role == "transition" and self.role != "parameter"
         return previous(self.symbol) if lagging else self.symbol
 
@@ -128,21 +128,22 @@ class Equations:
         return [p for p in self.parts.values() if p.role == role]
 
     def law(self, part: Part, role: str = "") -> Distribution:
-        """The law of a state (in the transition unless role is "initial") or of a channel."""
+        """The distribution of a state (in the transition unless role is "initial") or of a
+        channel."""
         if part.role == "channel":
             return self.trace.observations[part.name].distribution
         sites = self.trace.initial if role == "initial" else self.trace.transition
         return sites[part.name].distribution
 
     def mean(self, part: Part, role: str = "") -> Expr | NotApplicable:
-        """The value without noise of a state's or channel's law; why there is none."""
+        """The value without noise of a state's or channel's distribution; why there is none."""
         d = self.law(part, role)
         scale = scale_of_mean(d)
         return scale if isinstance(scale, NotApplicable) else noise_free(d, part.index)
 
     def step(self, part: Part) -> Expr | NotApplicable:
         """mean - x_prev: how far a state moves in a step, without noise in it nor in new values of
-        others that its law reads."""
+        others that its distribution reads."""
         mean = self._from_before(self.mean(part))
         if isinstance(mean, NotApplicable):
             return mean
@@ -298,12 +299,12 @@ def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]], near: float
 
 
 def time_symbol(role: str) -> Expr:
-    """`t` in a transition, and in another law."""
+    """`t` in a transition, and in another distribution."""
     return symbol("time_prev" if role == "transition" else "time", "t")
 
 
 def components(trace: Trace, role: str, name: str, shape: tuple[int, ...]) -> Any:
-    """The symbols of a named quantity seen from a law, a node for a scalar."""
+    """The symbols of a named quantity seen from a distribution, a node for a scalar."""
     site = {"state": trace.initial, "channel": trace.observations,
             "parameter": trace.parameters}.get(role, {}).get(name)  # fmt: skip
     value = symbols("input", name, shape) if site is None else site.value

@@ -120,7 +120,7 @@ def _now(s: Expr) -> Expr:
 
 
 def _means(d: Distribution) -> dict[tuple[int, ...], Expr]:
-    """The means of a law with noise, by their index; none of others."""
+    """The means of a distribution with noise, by their index; none of others."""
     if isinstance(d, Dirac) or scale_of_mean(d) != "identity":
         return {}
     values = array(d.mean())
@@ -129,7 +129,7 @@ def _means(d: Distribution) -> dict[tuple[int, ...], Expr]:
 
 def _noise_in(force: Force, trace: Trace) -> Expr | None:
     """The state with noise that is added to the force as it is; None where there is none, or
-    another law reads its new value."""
+    another distribution reads its new value."""
     own = {previous(s): s for s in trace.state_symbols}
     inside = [own[s] for s in symbols_of([force.value]) if s in own]
     noisy = [
@@ -153,7 +153,7 @@ def _noise_in(force: Force, trace: Trace) -> Expr | None:
 
 
 def _law_of(rate: Expr, trace: Trace) -> Distribution | None:
-    """The law of the state whose new value this is."""
+    """The distribution of the state whose new value this is."""
     for site in trace.transition.values():
         d = site.distribution
         if isinstance(d, Dirac) and any(e is rate for e in array(d.mean()).ravel()):

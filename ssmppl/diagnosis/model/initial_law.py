@@ -1,10 +1,10 @@
-"""A proper initial law for augmented models that cannot have a flat one.
+"""A proper initial distribution for augmented models that cannot have a flat one.
 
 A model whose x_1 is Flat has a likelihood while it is linear and Gaussian, and an effect may end
 that. Such a model gets x_1 ~ N(m, s^2) in each flat component, so wide that the data alone tell
-where it starts. As p(y) under it is then p(y) under the flat law (of density 1) times the largest
-density of the normal law, the log of that is taken off again (`log_correction`): gains over the
-model as it was compare like with like.
+where it starts. As p(y) under it is then p(y) under the flat distribution (of density 1) times the
+largest density of the normal distribution, the log of that is taken off again (`log_correction`):
+gains over the model as it was compare like with like.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ DIGITS = 2  # of the spread, which a reader of the model sees
 
 @dataclass(frozen=True)
 class ProperInitialLaw:
-    """The law of x_1 in place of a flat one.
+    """The distribution of x_1 in place of a flat one.
 
-    laws : by flat state, the mean and the spread of its proper law, of the state's shape.
+    laws : by flat state, the mean and the spread of its proper distribution, of the state's shape.
     """
 
     laws: Mapping[str, tuple[np.ndarray, np.ndarray]]
 
     @property
     def log_correction(self) -> float:
-        """Minus the log density of the laws at their means."""
+        """Minus the log density of the distributions at their means."""
         spread = np.concatenate([np.ravel(s) for _, s in self.laws.values()])
         return float(np.sum(np.log(spread)) + 0.5 * len(spread) * math.log(2.0 * math.pi))
 
     def applied_to(self, trace: Trace) -> Trace:
-        """The trace with these initial laws."""
+        """The trace with these initial distributions."""
         initial = dict(trace.initial)
         for name, (mean, spread) in self.laws.items():
             site = initial[name]
@@ -64,7 +64,7 @@ class ProperInitialLaw:
 def proper_initial_law(
     trace: Trace, starts: Sequence[np.ndarray], states: Sequence[np.ndarray]
 ) -> ProperInitialLaw | None:
-    """Proper laws of the flat states; None where there is none.
+    """Proper distributions of the flat states; None where there is none.
 
     starts : (D,) of each experiment, where its x_1 is about. states : (..., D) of each experiment,
     draws from where its states are.
@@ -88,7 +88,7 @@ def proper_initial_law(
 
 
 def needs_proper_initial_law(trace: Trace) -> bool:
-    """Whether an initial law is flat that cannot be."""
+    """Whether an initial distribution is flat that cannot be."""
     return bool(flat_start(trace)) and isinstance(linear_gaussian(trace), NotApplicable)
 
 

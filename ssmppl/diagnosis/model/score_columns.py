@@ -3,7 +3,7 @@
 The model with all candidates in it (`augment`) is derived in its own parameters and in the
 candidates' strengths, at strengths of zero. What the derivatives need beyond the states of the
 model - auxiliary states of some effects, sensitivities of deterministic components - is carried as
-further deterministic components of a model whose other laws are the base model's.
+further deterministic components of a model whose other distributions are the base model's.
 """
 
 from __future__ import annotations
@@ -115,9 +115,10 @@ def _linear_in(
     superset: Trace, strengths: Collection[str], inert: Collection[Expr],
     refused: dict[str, NotApplicable],
 ) -> Trace:  # fmt: skip
-    """The trace with deterministic laws linear in strengths, which is all that first derivatives at
-    zero see: products of two of them would have to be carried for nothing. In the laws of what is
-    inert the strengths are zero, as are those without a derivative, which are `refused`."""
+    """The trace with deterministic distributions linear in strengths, which is all that first
+    derivatives at zero see: products of two of them would have to be carried for nothing. In the
+    distributions of what is inert the strengths are zero, as are those without a derivative, which
+    are `refused`."""
     own = [s for s in superset.parameter_symbols if s.data[1] in strengths]
     zero: dict[Expr, Expr] = {s: constant(0.0) for s in own}
 

@@ -7,13 +7,13 @@ see `codegen/kernels/particle/scored_filters.py`.
 A model can predict one row well and drift away from reality in ten, as one-step predictions are
 corrected by every observation. So the filtered states of some rows are simulated on, and the
 continuous ranked probability score (CRPS) of what they give at each horizon is a statistic like the
-others, whose law comes from simulated data sets.
+others, whose distribution comes from simulated data sets.
 
 Data sets are drawn from a fitted model (`Simulator`) with the lengths, inputs and gaps of the data.
-A component of x_1 whose law is Flat cannot be drawn: it starts at its smoothed mean given the data,
-as does one whose law stands for a flat one (`initial_law.py`). What a linear Gaussian model with a
-flat start says of its disturbances does not depend on where it starts (P. de Jong, *Annals of
-Statistics* 19, 1991).
+A component of x_1 whose distribution is Flat cannot be drawn: it starts at its smoothed mean given
+the data, as does one whose distribution stands for a flat one (`initial_law.py`). What a linear
+Gaussian model with a flat start says of its disturbances does not depend on where it starts (P. de
+Jong, *Annals of Statistics* 19, 1991).
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ class Smoother:
         self, system: ParticleSystem, weights: np.ndarray, e: Experiment, theta: np.ndarray,
         stream: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Particles (T, D, N) and weights (T, N) of the filtering law at each row.
+        """Particles (T, D, N) and weights (T, N) of the filtering distribution at each row.
 
         Of the filter itself; under the twisted proposal, whose particles know what comes later,
         draws from the extended Kalman filter, in pairs mirrored at its mean.
@@ -251,8 +251,8 @@ def _as_particles(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def _drawn(
     mean: np.ndarray, covariance: np.ndarray, stream: np.ndarray, n: int = PREDICTIVE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Particles (T, D, N), in pairs mirrored at the mean, and weights (T, N) of normal laws with
-    these moments (T, D), (T, D, D)."""
+    """Particles (T, D, N), in pairs mirrored at the mean, and weights (T, N) of normal
+    distributions with these moments (T, D), (T, D, D)."""
     # Rows before a flat start is known have none: what is drawn there is NaN, as their mean is.
     values, vectors = np.linalg.eigh(np.where(np.isfinite(covariance), covariance, 0.0))
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -294,8 +294,8 @@ def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
     """(T,) continuous ranked probability score of predictive samples (T, M), smaller is better.
 
     mean |x_i - y| - sum_{i<j} |x_i - x_j| / (M (M - 1)): fair, i.e. unbiased for the score of the
-    law that the M samples come from (Gneiting and Raftery 2007; Zamo and Naveau 2018, equation 6).
-    NaN where nothing was observed, or a sample is infinite.
+    distribution that the M samples come from (Gneiting and Raftery 2007; Zamo and Naveau 2018,
+    equation 6). NaN where nothing was observed, or a sample is infinite.
     """
     x, y = np.sort(np.asarray(samples, float), axis=-1), np.asarray(observed, float)
     m = x.shape[-1]
@@ -383,7 +383,8 @@ def mean_scores(
 class Simulator:
     """Draws from a model at given parameters.
 
-    program : of the model, which is used as it is where x_1 has a law. kalman : of the model where
+    program : of the model, which is used as it is where x_1 has a distribution. kalman : of the
+        model where
     it is linear and Gaussian. held : further states that start at a mean; initial_means : of an
     experiment and theta (P,), the means (D,) of x_1 that these take.
     """
@@ -444,7 +445,7 @@ class Simulator:
 
 
 def _with_initial_parameters(trace: Trace, flat: Sequence[Site]) -> Trace:
-    """The trace with flat initial laws replaced by further parameters."""
+    """The trace with flat initial distributions replaced by further parameters."""
     initial, parameters = dict(trace.initial), dict(trace.parameters)
     for site in flat:
         name = f"{site.name}_start"

@@ -1,8 +1,8 @@
 """A traced model as a model file that a person reads, and as a `Model` again.
 
-The file stands by itself: it imports numpy, ssmppl and the user's own primitives and laws, keeps
-the user's names, and gives, when it is traced, the laws it was written from, expression by
-expression.
+The file stands by itself: it imports numpy, ssmppl and the user's own primitives and distributions,
+keeps the user's names, and gives, when it is traced, the distributions it was written from,
+expression by expression.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def model_text(
 
 
 def to_model(trace: Trace) -> Model:
-    """An ordinary `Model` with the laws of a trace: what `model_text` gives, executed.
+    """An ordinary `Model` with the distributions of a trace: what `model_text` gives, executed.
 
     Errors and explanations show the lines of that text. What the user's own modules define is
     taken from them, as they may be scripts that would run again if they were imported.
@@ -200,7 +200,7 @@ class _Writer:
         return "\n".join([*head, f"{INDENT}return {{", *inside, f"{INDENT}}}"])
 
     def _arrays(self, used: Iterable[Expr]) -> dict[str, Any]:
-        """Name -> its symbols as this law sees them."""
+        """Name -> its symbols as this distribution sees them."""
         out = {}
         for kind, name in {s.data[:2]: None for s in sorted(used, key=repr)}:
             value = self.quantities.get(name)
@@ -264,7 +264,7 @@ class _Writer:
         return _call(kind, texts, room)
 
     def _written(self, d: UserDefined, lines: Lines, room: int) -> str:
-        """A law of the user's own, its arguments by name."""
+        """A distribution of the user's own, its arguments by name."""
         texts = []
         for i, (argument, values) in enumerate(d.parameters.items()):
             wide = bool(d.shape) and i == 0 and all(map(_same, d.parameters.values()))
@@ -284,7 +284,7 @@ def _wishes(role: str, sites: list[Site]) -> dict[Expr, str]:
 
 
 def _read(roots: Sequence[Expr]) -> frozenset[Expr]:
-    """The symbols that a law reads. Simulators are told the row, which is not written."""
+    """The symbols that a distribution reads. Simulators are told the row, which is not written."""
     nodes = topological(roots)
     rows = {n.args[-1] for n in nodes if n.op == OP}
     read = {a for n in nodes for a in (n.args[:-1] if n.op == OP else n.args)}
@@ -312,7 +312,7 @@ def _signature(role: str, arguments: Sequence[str]) -> str:
 
 
 def _numbered(laws: list[str]) -> list[str]:
-    """The laws with distinct names of their functions: prior, prior_2, ..."""
+    """The distributions with distinct names of their functions: prior, prior_2, ..."""
     out: list[str] = []
     count: dict[str, int] = {}
     for law in laws:
@@ -430,14 +430,14 @@ def _wanted(d: Distribution) -> Iterable[Import]:
 
 
 def _laws(d: Distribution) -> Iterable[Distribution]:
-    """A law and those that it is made of."""
+    """A distribution and those that it is made of."""
     yield d
     for part in d.inside():
         yield from _laws(part)
 
 
 def nodes_of(d: Distribution) -> list[Expr]:
-    """All expressions of a law, those of what it is made of among them."""
+    """All expressions of a distribution, those of what it is made of among them."""
     if isinstance(d, Flat):
         return []
     if isinstance(d, Mixture):

@@ -23,8 +23,8 @@ class GapReport(Findings):
     ----------
     verdict : "effect", "none of these" or "no measurable gap".
     where : one row for each place that stands out, strongest first: the equation, the moment of
-        its law (mean, scale, tails, time dependence), when (t_from, t_to), the region of states and
-        inputs in words, z and its family-wise p.
+        its distribution (mean, scale, tails, time dependence), when (t_from, t_to), the region of
+        states and inputs in words, z and its family-wise p.
     causes : candidate effects, best first. `gain_screen` is the gain in nats that the score
         predicts, `gain_refit` the one after refitting, NaN where it was not refitted; `sign` the
         constraint on the strength or the sign found, `estimate` and `se` that strength.
@@ -34,7 +34,7 @@ class GapReport(Findings):
     closed : the chosen model first: share F of the reference model's gain on data that took
         no part in choosing it, with a 95% interval (infinite ends where the data do not bound it;
         F NaN where there is no measurable gap); the gain in nats per sample, and its parts in all
-        from the mean and from the noise law; the error of a free run before and after.
+        from the mean and from the noise distribution; the error of a free run before and after.
     detection : tests of the one-step predictions by observation channel.
     residual_map : standardised smoothed score by equation and window of time.
     free_run : the data, and the models run without seeing them, before and after (NaN if there is

@@ -76,11 +76,12 @@ def _nested(values: np.ndarray) -> str:
 
 
 class Lines:
-    """The body of one law: statements, and texts of expressions that refer to them.
+    """The body of one distribution: statements, and texts of expressions that refer to them.
 
     Parameters
     ----------
-    roots : all expressions of the law; what occurs several times under them is written once.
+    roots : all expressions of the distribution; what occurs several times under them is written
+        once.
     quantities : name -> its symbols, of its shape, for arrays that are a whole quantity.
     taken : names that local variables must not have.
     marks : node -> (name of a local variable, comment), for what stands on a line of its own.
@@ -165,7 +166,7 @@ class Lines:
         )
 
     def _loop(self, node: Expr) -> Text:
-        """A function of what moves, in the law's body, and its repetition."""
+        """A function of what moves, in the distribution's body, and its repetition."""
         loop = node.data
         first, held = node.args[: loop.states], node.args[loop.states : -1]
         for a in held:  # numbers of the law, which the function reads

@@ -2,8 +2,8 @@
 
 z_t = Phi^-1 of the probability integral transform of the one-step prediction is standard normal
 white noise under the true parameters (M. Rosenblatt 1952; F. Diebold, T. Gunther and A. Tay 1998).
-Under fitted ones it is not quite: what is computed here has its law from data sets simulated at the
-fit, made orthogonal to the nuisance scores (`efficient`), and never from a table.
+Under fitted ones it is not quite: what is computed here has its distribution from data sets
+simulated at the fit, made orthogonal to the nuisance scores (`efficient`), and never from a table.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Efficient scores: what is left of a candidate's score once the nuisance scores are projected out.
 
-B data sets simulated at the fitted parameters give the joint law of the candidates' statistics
-S (K,) and of the nuisance scores S_theta (P,). The efficient statistic is the residual of the
-regression of S on S_theta over the sets (C. R. Rao; here by parametric bootstrap, without refits):
+B data sets simulated at the fitted parameters give the joint distribution of the candidates'
+statistics S (K,) and of the nuisance scores S_theta (P,). The efficient statistic is the residual
+of the regression of S on S_theta over the sets (C. R. Rao; here by parametric bootstrap, without
+refits):
 
     S~ = S - I_k,theta I_theta,theta^-1 S_theta,    V = var S~,    z = S~ / sqrt(V),
     predicted gain z^2 / 2 nats,    first estimate of the strength S~ / V.
@@ -129,7 +130,7 @@ class Null:
         cls, columns: Any, nuisance: Any, *, quadratic: Any = False, sided: Any = 0,
         noise: Any = 0.0,
     ) -> Null:  # fmt: skip
-        """The null law, its shapes checked and scalars spread over the columns.
+        """The null distribution, its shapes checked and scalars spread over the columns.
 
         Raises
         ------
@@ -156,7 +157,7 @@ class Null:
 
 @dataclass(frozen=True)
 class Efficient:
-    """Efficient statistics of one data set, beside their null law.
+    """Efficient statistics of one data set, beside their null distribution.
 
     score : (K,) S~. variance : (K,) V, Monte Carlo variance taken off. z, gain, strength : (K,);
     a quadratic column's z is the normal score of its studentised statistic (see `normal_score`),
@@ -243,7 +244,7 @@ def balanced(
     """Studentised statistics (K,), (B, K), with the quadratic columns turned into normal scores.
 
     A random walk's statistic is nearly one squared normal: left as it is, its tail alone would set
-    the law of the largest of all candidates, and nothing else could ever be found.
+    the distribution of the largest of all candidates, and nothing else could ever be found.
     """
     t, null = t.copy(), null.copy()
     for k in np.flatnonzero(quadratic):
@@ -254,7 +255,7 @@ def balanced(
 
 
 def normal_score(t: np.ndarray | float, skewness: np.ndarray | float) -> np.ndarray:
-    """z with Phi(z) = F(t), F the standardised gamma law with this skewness.
+    """z with Phi(z) = F(t), F the standardised gamma distribution with this skewness.
 
     Three moments matched, exact for sums of equally weighted squared normals (P. Hall, *Statistics*
     14, 1983; M. Buckley and G. Eagleson 1988). Bounded below by -8.

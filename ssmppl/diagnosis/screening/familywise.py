@@ -5,10 +5,11 @@ correlations between candidates are in the maxima. A family of shapes of one eff
 delays, dead-zone widths) counts as one hypothesis whose statistic is its largest member.
 
 The largest of hundreds of shapes lies higher by chance than a single statistic. Left as they are,
-such families alone would make the law of the largest of all, and whatever has one shape would have
-to stand as high as they do. So hypotheses are put on one scale before they are compared, as the
-smallest p in place of the largest statistic does (section 2.5 there), but by a `NullScale` of two
-numbers for each: the p values themselves would have to be counted far beyond the simulated range.
+such families alone would make the distribution of the largest of all, and whatever has one shape
+would have to stand as high as they do. So hypotheses are put on one scale before they are compared,
+as the smallest p in place of the largest statistic does (section 2.5 there), but by a `NullScale`
+of two numbers for each: the p values themselves would have to be counted far beyond the simulated
+range.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ def _as_one(heights: np.ndarray, number: np.ndarray) -> np.ndarray:
 class FamilyWise:
     """p-values with the whole family taken into account.
 
-    labels : (G,) of the groups. p : (G,) step-down adjusted. p_single : (G,) against the law of
+    labels : (G,) of the groups. p : (G,) step-down adjusted. p_single : (G,) against the
+        distribution of
     the largest of all. best : (G,) column that leads its group. height : (G,) its statistic on the
     common scale. maxima : (B,) largest on that scale of each simulated set. scale : of the groups.
     sided : (G,) whether its strength has a sign.
@@ -149,9 +151,9 @@ def tail_p(value: float, maxima: np.ndarray) -> float:
     """P(largest statistic >= value) from its B simulated values.
 
     By counting (with the observed set counted among them) up to the largest tenth; beyond, by a
-    generalised Pareto law of the excesses (Pickands 1975; probability-weighted moments of Hosking
-    and Wallis 1987). Made to err upwards: the shape is at least 0, an exponential tail, where
-    normal statistics have lighter ones, and the mean excess is taken a standard error larger.
+    generalised Pareto distribution of the excesses (Pickands 1975; probability-weighted moments of
+    Hosking and Wallis 1987). Made to err upwards: the shape is at least 0, an exponential tail,
+    where normal statistics have lighter ones, and the mean excess is taken a standard error larger.
     """
     sets = len(maxima)
     ordered = np.sort(maxima)[::-1]

@@ -9,7 +9,7 @@ V the bootstrap's covariance, its directions of next to no variance cut, w the s
 and Wolf (*J. Multivariate Analysis* 88, 2004): with B = 200 sets and D = 12 the small eigenvalues
 of V come out too small, and their inverses would rule Q. Set b is measured by the V of the other
 sets (Sherman and Morrison), as the observed one is; Q in turn is put on the normal scale by its
-simulated law, so that groups of different size compare.
+simulated distribution, so that groups of different size compare.
 
 When the gap opens is the stretch of time that carries more of a statistic than its share. The
 scores of a group summed over J bins of time, W_1 .. W_J, add up to S~. Projected on the estimated
@@ -47,7 +47,7 @@ LEAST_VARIANCE = 1e-3  # of a window's contrast, in shares of the whole: less is
 
 @dataclass(frozen=True)
 class BasisGroupScore:
-    """Efficient scores of D basis functions in one data set, beside their null law.
+    """Efficient scores of D basis functions in one data set, beside their null distribution.
 
     score : (D,) S~. covariance : (D, D) V. inverse : (D, D) M^-1, in the directions kept.
     statistic : Q. z : its normal score. null : (B,) those of the simulated sets. kappa :
@@ -241,7 +241,8 @@ def regions(
 
 
 def _normal(value: float, null: np.ndarray) -> tuple[float, np.ndarray]:
-    """A statistic that is large when something is wrong, and its null law, as normal scores."""
+    """A statistic that is large when something is wrong, and its null distribution, as normal
+    scores."""
     spread = null.std()
     if not spread > 0.0:
         return 0.0, np.zeros_like(null)

@@ -1,7 +1,7 @@
 """The screen: all candidates, the basis and the detection statistics from one set of simulations.
 
 B data sets are simulated at the fitted parameters and go through the same smoother as the data;
-every statistic of the report that is not a refit takes its null law from them
+every statistic of the report that is not a refit takes its null distribution from them
 (`efficient_score.py`).
 """
 
@@ -352,7 +352,8 @@ def screen_part(
     whole: Screen, experiments: Sequence[Experiment], theta: np.ndarray,
     seed: np.random.SeedSequence,
 ) -> Screen:  # fmt: skip
-    """The screen of a part of the data by the law of the sets that were simulated for all of them.
+    """The screen of a part of the data by the distribution of the sets that were simulated for all
+    of them.
 
     theta : (P,) fitted to the part. The scale is that of the information which the part holds
     (`compare_with_null`), so that little changes where a tenth is missing, and nothing is

@@ -7,9 +7,9 @@ Scores are compared on the scale of the observed information, that which each da
 acts only where a state seldom goes (a stop, an overflow, a curve far out) has next to no
 information in most simulated sets and very much in a few. Its variance over the sets is that of
 the few, and one of them may lie forty standard deviations out: enough to hide everything else in
-the law of the largest. Given where the states went the information is known, and the score is
-compared with that (D. Cox and D. Hinkley, *Theoretical Statistics* 1974, section 4.8, on observed
-and expected information): a score S with the sum of squares R of its rows is divided by
+the distribution of the largest. Given where the states went the information is known, and the score
+is compared with that (D. Cox and D. Hinkley, *Theoretical Statistics* 1974, section 4.8, on
+observed and expected information): a score S with the sum of squares R of its rows is divided by
 sqrt(R / (2 r)) where R is more than twice the r of a typical set. Below that nothing is changed, as
 R counts what is unmodelled along with the information.
 """

@@ -202,7 +202,8 @@ class EffectSelection:
 
     def _by_refit(self, out: SelectionResult, alpha: float) -> bool:
         """Whether a refit gains more than chance: by bootstrap where that is affordable, else by
-        the law of the scores, the same to first order (likelihood ratio and score tests)."""
+        the distribution of the scores, the same to first order (likelihood ratio and score
+        tests)."""
         found = {r.index[0]: gain_p(self.screen, r) for r in out.refits}
         if not found or min(found.values()) > CLOSER_LOOK_FACTOR * alpha:
             return False

@@ -10,7 +10,7 @@ Scales and shares may be driven to a bound of their support: a process noise of 
 likelihood is flat on the unconstrained scale: where the climb ended says nothing (1e-4 or 1e-13, as
 it happened), and a curvature there is no information. Such a number is held at the value nearest to
 where it is of consequence, the farthest inside that costs next to nothing, which keeps the other
-numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their law).
+numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their distribution).
 """
 
 from __future__ import annotations
@@ -234,7 +234,8 @@ class Fitter:
 
     @property
     def log_correction(self) -> float:
-        """Nats for each experiment that a proper initial law in place of a flat one takes."""
+        """Nats for each experiment that a proper initial distribution in place of a flat one
+        takes."""
         return self.initial_law.log_correction if self.initial_law else 0.0
 
     def restored(self, experiments: Sequence[Experiment], numbers: Mapping[str, np.ndarray]) -> Fit:
@@ -326,7 +327,8 @@ class Fitter:
     def _extended_log_likelihood(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
         """theta (P,) -> log p(y | theta) by the extended Kalman filter, -inf where it has no
         number; None where the model has no such filter. Of a linear Gaussian model by the exact
-        filter where rounding leaves that one without a number, as next to a vague initial law."""
+        filter where rounding leaves that one without a number, as next to a vague initial
+        distribution."""
         found = problem.program.gaussian if self.settings.proposal == "twisted" else None
         if not isinstance(found, GaussianApproximation):
             return None
@@ -418,7 +420,7 @@ class Fitter:
         self, fit: Fit | None, space: Space, top: Top, seed: np.random.SeedSequence
     ) -> Fit:
         """The fit, or the top of the approximation where the particles' score led to nothing
-        higher: with next to no noise in a law that score is mostly Monte Carlo error."""
+        higher: with next to no noise in a distribution that score is mostly Monte Carlo error."""
         value, error = self.log_likelihood(space.problem.experiments, space.theta, seed)
         if fit is not None:
             prior = density_of(space, lambda theta: 0.0)

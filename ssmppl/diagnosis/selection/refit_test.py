@@ -1,12 +1,14 @@
-"""Tests of the gain of the best refit, by the law of the scores or by parametric bootstrap.
+"""Tests of the gain of the best refit, by the distribution of the scores or by parametric
+bootstrap.
 
 Where noise has grown to swallow what is missing, the score at the fit is far smaller than what a
 refit gains, as the refit lets the noise shrink again (a break in the level of a random walk). So
-the gain itself is tested: by the law of the scores, which is the same to first order (likelihood
-ratio and score tests); in short records, where a fit takes little time and first order is a poor
-guide, by its own: data sets simulated at theta-hat are fitted, screened and refitted as the data
-were. That test stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika*
-78, 1991), and as soon as the gain lies far beyond the tail of the simulated ones (`tail_p`).
+the gain itself is tested: by the distribution of the scores, which is the same to first order
+(likelihood ratio and score tests); in short records, where a fit takes little time and first order
+is a poor guide, by its own: data sets simulated at theta-hat are fitted, screened and refitted as
+the data were. That test stops as soon as it cannot reject any more (J. Besag and P. Clifford,
+*Biometrika* 78, 1991), and as soon as the gain lies far beyond the tail of the simulated ones
+(`tail_p`).
 """
 
 from __future__ import annotations

@@ -55,10 +55,10 @@ def integrate(
 
     Parameters
     ----------
-    rhs : function of the state, written as the laws of a model are, that gives its derivative by
-        time; of a dict it may take the values by name (`def swing(angle, speed)`) or the dict. What
-        else it depends on (parameters, inputs) it reads from where it is written; all that stays
-        what it is over the time.
+    rhs : function of the state, written as the distributions of a model are, that gives its
+        derivative by time; of a dict it may take the values by name (`def swing(angle, speed)`) or
+        the dict. What else it depends on (parameters, inputs) it reads from where it is written;
+        all that stays what it is over the time.
     state : number or symbol, vector, or dict of these by name, at the beginning.
     dt : the time, in the unit of the derivative's; a number, or a symbol such as the time step.
     method : "euler", "semi-implicit" (velocities first, then positions with the new ones, which
@@ -119,8 +119,8 @@ def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = T
 
     Parameters
     ----------
-    step : function of the state, written as the laws of a model are, that gives the next one; of a
-        dict as in `integrate`.
+    step : function of the state, written as the distributions of a model are, that gives the next
+        one; of a dict as in `integrate`.
     state : number or symbol, vector, or dict of these by name, at the beginning.
     times : how often, from 0; a symbol counts as its whole part, and as 0 where it is none. The
         model's text and the time of its compilation do not grow with it.

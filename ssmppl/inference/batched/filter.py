@@ -171,7 +171,7 @@ class BatchedFilter:
 
 
 class _Part:
-    """Expressions of one law, evaluated for all lanes."""
+    """Expressions of one distribution, evaluated for all lanes."""
 
     def __init__(self, trace: Trace, expressions: Sequence[Expr]):
         self.size = len(expressions)

@@ -62,7 +62,8 @@ def importance(other: np.ndarray) -> Bridge:
 
 @dataclass(frozen=True)
 class Student:
-    """The law bridged to, a multivariate t: location (d,), factor (d, d) of its scale matrix."""
+    """The distribution bridged to, a multivariate t: location (d,), factor (d, d) of its scale
+    matrix."""
 
     location: np.ndarray
     factor: np.ndarray

@@ -4,7 +4,7 @@ Wigren, Risuleo, Murray and Lindsten (2019), "Parameter elimination in particle 
 With B the eliminated parameters and R the others, one sweep is
 
 1. for each experiment j, x_j by conditional SMC for p(x_j | x of the others, y, R), B integrated
-   out (`analysis/elimination/elimination.py`): a step that leaves this law invariant;
+   out (`analysis/elimination/elimination.py`): a step that leaves this distribution invariant;
 2. B from p(B | x, y, R), its conjugate family, whatever it was before;
 3. the other updates as ever.
 
@@ -183,7 +183,7 @@ class Eliminating(GibbsUpdates):
         return np.concatenate(out)
 
     def _draw(self, totals: np.ndarray, theta: np.ndarray, generator: np.random.Generator) -> None:
-        """The eliminated parameters from their law given the trajectories, in place."""
+        """The eliminated parameters from their distribution given the trajectories, in place."""
         at = 0
         for update, positions in zip(self.updates, self.positions, strict=True):
             own = totals[at : at + len(update.functions)].tolist()

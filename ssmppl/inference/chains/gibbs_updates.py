@@ -108,7 +108,7 @@ def draw_parameters(
     Raises
     ------
     SamplingError : the density is zero, or infinite, where the chain stands; names the block's
-        values, and the law that has no density there, if there is one.
+        values, and the distribution that has no density there, if there is one.
     """
     infos = []
     for k, update in enumerate(steps.updates):

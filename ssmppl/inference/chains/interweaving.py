@@ -21,19 +21,19 @@ with it; step 1 and its inverse change variables only. (It is a group move in th
 Sabatti 2000, "Generalised Gibbs sampler", *Biometrika* 87, with Metropolis in place of a draw.) The
 map may depend on data and on anything fixed before the chains start, but on no state of a chain.
 
-Two maps are at hand (`NoiseMove`). The noises of the model's laws are plain non-centring. Those of
-a Gaussian approximation to p(x | y, theta) take the data into the map: on a linear Gaussian model,
-where it is exact, pi(theta, x) is p(theta | y) times a function of e alone, a Metropolis step on
-the marginal; elsewhere nearly so. (Compare Murray and Adams 2010, "Slice sampling covariance
-hyperparameters of latent Gaussian models"; Tan 2023, "Efficient data augmentation techniques for
-some classes of state space models", *Statistical Science* 38, where the data choose location and
-scale of the states.) Where the states can be drawn exactly, the step is on p(theta | y) itself,
-before they are drawn (`Collapsed`). There more numbers than a random walk can move at once are
-also proposed about a mode m of p(z | y): z' = m + sqrt(1 - s^2) (z - m) + s N(0, C), which keeps
-N(m, C), C from the information at m (Cotter, Roberts, Stuart and White 2013, "MCMC methods for
-functions: modifying old algorithms to make them faster", *Statistical Science* 28; here with the
-posterior's own Gaussian approximation in place of the prior). One step of a sweep remains a random
-walk, for tails that are not Gaussian.
+Two maps are at hand (`NoiseMove`). The noises of the model's distributions are plain non-centring.
+Those of a Gaussian approximation to p(x | y, theta) take the data into the map: on a linear
+Gaussian model, where it is exact, pi(theta, x) is p(theta | y) times a function of e alone, a
+Metropolis step on the marginal; elsewhere nearly so. (Compare Murray and Adams 2010, "Slice
+sampling covariance hyperparameters of latent Gaussian models"; Tan 2023, "Efficient data
+augmentation techniques for some classes of state space models", *Statistical Science* 38, where the
+data choose location and scale of the states.) Where the states can be drawn exactly, the step is on
+p(theta | y) itself, before they are drawn (`Collapsed`). There more numbers than a random walk can
+move at once are also proposed about a mode m of p(z | y): z' = m + sqrt(1 - s^2) (z - m) + s N(0,
+C), which keeps N(m, C), C from the information at m (Cotter, Roberts, Stuart and White 2013, "MCMC
+methods for functions: modifying old algorithms to make them faster", *Statistical Science* 28; here
+with the posterior's own Gaussian approximation in place of the prior). One step of a sweep remains
+a random walk, for tails that are not Gaussian.
 
 All choices are made in the warmup: which parameters move (those slow in the plain chain at its
 beginning), the walk's covariance, which of the maps; afterwards the kernel is fixed.
@@ -213,7 +213,7 @@ class NoiseMove:
 
     @cached_property
     def data_told_by(self) -> bool:
-        """Whether a parameter is in the law of an observation."""
+        """Whether a parameter is in the distribution of an observation."""
         assert not isinstance(self.found.lookahead, NotApplicable)
         return any(s.data[0] == "parameter" for s in symbols_of(self.found.lookahead.observed))
 

@@ -275,8 +275,8 @@ class ScoredLikelihood(_KeepsPaths):
 class CorrelatedLikelihood(_KeepsPaths):
     """A particle filter on random numbers that move by v' = rho v + sqrt(1 - rho^2) e.
 
-    The move leaves the normal law of the numbers invariant and is reversible, so that they may be
-    part of the chain's state (Deligiannidis, Doucet and Pitt 2018, section 2.2).
+    The move leaves the normal distribution of the numbers invariant and is reversible, so that they
+    may be part of the chain's state (Deligiannidis, Doucet and Pitt 2018, section 2.2).
     """
 
     problem: Problem

@@ -103,7 +103,7 @@ def _data(e: Experiment) -> str:
 
 
 def model_digest(trace: Trace) -> str:
-    """Of laws and expressions, without where they were written."""
+    """Of distributions and expressions, without where they were written."""
     lines = [trace.name, repr(trace.inputs)]
     lines += [repr(trace.time_step)] if trace.time_step else []
     roots: list[Expr] = []

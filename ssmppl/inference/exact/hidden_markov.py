@@ -1,9 +1,9 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
-The laws of the model are tables over the values; they may depend on parameters, inputs, time and
-observations before. One generated pass writes them down, over all values, rows and data sets
-(`histories.py`), and another sums their derivatives up; what lies between are the compiled passes
-that know no model. Whatever else is a function of the values, as what is expected of an
+The distributions of the model are tables over the values; they may depend on parameters, inputs,
+time and observations before. One generated pass writes them down, over all values, rows and data
+sets (`histories.py`), and another sums their derivatives up; what lies between are the compiled
+passes that know no model. Whatever else is a function of the values, as what is expected of an
 observation, is evaluated by the interpreter.
 
 A value that the data have made 1e-300 times as likely as another is no number any more, and yet it
@@ -49,7 +49,8 @@ T = TypeVar("T")
 class Filtered:
     """What the forward pass tells of some histories (R rows in all, K values), or of one.
 
-    log_increments : (R,) log p(y_t | y_{1:t-1}). predicted, filtered : (R, K) laws of x_t given
+    log_increments : (R,) log p(y_t | y_{1:t-1}). predicted, filtered : (R, K) distributions of x_t
+        given
     y_{1:t-1} and y_{1:t}, or their logarithms if `logs`. first : (S + 1,) and move : (R or 1, K,
     K), as of the kernels, likewise.
     """
@@ -77,8 +78,8 @@ class Filtered:
         return Filtered(*own, self._first[s : s + 2] - self._first[s], move, self.logs)
 
     def smoothed(self, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Laws (R, K) of x_t given all data, and (R, K, K) of (x_{t-1}, x_t), zero in first rows;
-        without pairs the latter is empty."""
+        """Distributions (R, K) of x_t given all data, and (R, K, K) of (x_{t-1}, x_t), zero in
+        first rows; without pairs the latter is empty."""
         shape = self._filtered.shape
         law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0))
         entry = exact_entry("finite_backward_logs" if self.logs else "finite_backward")
@@ -96,8 +97,8 @@ class Filtered:
 
 @dataclass(frozen=True)
 class Tables:
-    """The laws over the values of some histories, as of the kernels: log_start (S, K), log_move and
-    move (R or 1, K, K), log_g (R, K)."""
+    """The distributions over the values of some histories, as of the kernels: log_start (S, K),
+    log_move and move (R or 1, K, K), log_g (R, K)."""
 
     log_start: np.ndarray
     log_move: np.ndarray
@@ -160,8 +161,8 @@ class Kept:
 
 @dataclass(frozen=True)
 class HiddenMarkov(Scored):
-    """A traced model as one of finitely many values (K, D): its laws as tables over these, and its
-    exact passes."""
+    """A traced model as one of finitely many values (K, D): its distributions as tables over these,
+    and its exact passes."""
 
     form: FiniteStates
     _kept: Kept = field(default_factory=Kept, repr=False, compare=False)
@@ -180,7 +181,7 @@ class HiddenMarkov(Scored):
         return columns, np.repeat(columns, size, axis=1), np.tile(columns, size)
 
     def tables(self, h: Histories, theta: np.ndarray) -> Tables:
-        """The laws over the values."""
+        """The distributions over the values."""
         size, rows = len(self.values), len(h.y)
         given = self.trace, h.missing
         moves = rows if self._kept.once(("varies", h.missing), varies_by_row, *given) else 1
@@ -211,8 +212,8 @@ class HiddenMarkov(Scored):
         self, h: Histories, theta: np.ndarray, role: str, expressions: Sequence[Expr],
         law: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
-        """Sums over data sets, rows and values of each expression, weighed by a law of `laws`: of
-        pairs for "transition". What has no weight does not count, be it infinite."""
+        """Sums over data sets, rows and values of each expression, weighed by a distribution of
+        `laws`: of pairs for "transition". What has no weight does not count, be it infinite."""
         out = np.zeros(len(expressions))
         counts = np.repeat(h.weights, h.steps)
         law = law * counts.reshape(-1, *(1,) * (law.ndim - 1))
@@ -269,7 +270,7 @@ class HiddenMarkov(Scored):
         return total
 
     def filter(self, experiment: Experiment, theta: np.ndarray) -> Filtered:
-        """The laws of x_t given what came up to t.
+        """The distributions of x_t given what came up to t.
 
         Raises
         ------
@@ -317,7 +318,8 @@ class HiddenMarkov(Scored):
     def smooth_each(
         self, experiments: Sequence[Experiment], theta: np.ndarray
     ) -> list[tuple[SmoothedMoments, np.ndarray]]:
-        """As `smooth`, of each experiment; and the laws (T, K) of the combinations of values.
+        """As `smooth`, of each experiment; and the distributions (T, K) of the combinations of
+        values.
 
         Raises
         ------
@@ -341,8 +343,9 @@ class HiddenMarkov(Scored):
         return SmoothedMoments(mean, covariance, cross, value)
 
     def moments(self, law: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means (T, D) and covariances (T, D, D) by laws (T, K) of the combinations, and what these
-        are away from the means (T, K, D): far from zero, squares of x would differ by rounding."""
+        """Means (T, D) and covariances (T, D, D) by distributions (T, K) of the combinations, and
+        what these are away from the means (T, K, D): far from zero, squares of x would differ by
+        rounding."""
         mean = law @ self.values
         away = self.values - mean[:, None, :]
         return mean, _outer(away, law[:, :, None] * away), away
@@ -387,8 +390,8 @@ class HiddenMarkov(Scored):
         return out
 
     def quantiles(self, law: np.ndarray, levels: np.ndarray) -> np.ndarray:
-        """(T, P, D) smallest values of each component whose distribution function, by the laws
-        (T, K) of the combinations, reaches the levels (P,)."""
+        """(T, P, D) smallest values of each component whose distribution function, by the
+        distributions (T, K) of the combinations, reaches the levels (P,)."""
         out = np.empty((len(law), len(levels), self.values.shape[1]))
         for d, column in enumerate(self.values.T):
             values, index = np.unique(column, return_inverse=True)
@@ -401,7 +404,7 @@ class HiddenMarkov(Scored):
         self, experiments: Sequence[Experiment], theta: np.ndarray, laws: Sequence[np.ndarray]
     ) -> list[np.ndarray]:
         """(T, 4, K) of each experiment: mean, variance, P(Y <= y) and P(Y < y) of each channel, by
-        the laws (T, K) of the combinations that are predicted."""
+        the distributions (T, K) of the combinations that are predicted."""
         each = []
         for h, law in self._by_history(experiments, laws):
             out = []
@@ -422,8 +425,9 @@ class HiddenMarkov(Scored):
         self, experiments: Sequence[Experiment], theta: np.ndarray, laws: Sequence[np.ndarray],
         levels: np.ndarray,
     ) -> list[np.ndarray]:  # fmt: skip
-        """(T, P, K) of each experiment at the levels (P,), likewise: of the mixture of the laws
-        given each value. NaN where these have no distribution function, or no inverse of it."""
+        """(T, P, K) of each experiment at the levels (P,), likewise: of the mixture of the
+        distributions given each value. NaN where these have no distribution function, or no inverse
+        of it."""
         sites = self.trace.observations.values()
         every = [c for site in sites for c in channels(site)]
         each = []
@@ -440,7 +444,7 @@ class HiddenMarkov(Scored):
         self, h: Histories, theta: np.ndarray, law: np.ndarray, k: int, channel: Channel,
         level: float,
     ) -> np.ndarray:  # fmt: skip
-        """(R,) of channel k, by the laws (R, K) of the combinations that are predicted."""
+        """(R,) of channel k, by the distributions (R, K) of the combinations that are predicted."""
         own = self.trace.observation_symbols[k]
 
         def below(values: np.ndarray) -> np.ndarray:
@@ -456,7 +460,7 @@ class HiddenMarkov(Scored):
     def _by_history(
         self, experiments: Sequence[Experiment], laws: Sequence[np.ndarray]
     ) -> Iterator[tuple[Histories, np.ndarray]]:
-        """The laws (T, K) of each experiment as (R, K) of the distinct ones."""
+        """The distributions (T, K) of each experiment as (R, K) of the distinct ones."""
         for h in self.histories_of(experiments):
             first = h.members[np.searchsorted(h.which, np.arange(h.size))]
             yield h, np.concatenate([laws[i] for i in first])

@@ -81,11 +81,11 @@ class Start:
 def diffuse_filter(
     model: Matrices, flat: tuple[int, ...], experiment: Experiment, *outputs: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """factor (G, G) and right (G,) of the law of the flat part; outputs as of the kernel.
+    """factor (G, G) and right (G,) of the distribution of the flat part; outputs as of the kernel.
 
     Raises
     ------
-    Stopped : the laws have no density at theta.
+    Stopped : the distributions have no density at theta.
     """
     g = len(flat)
     factor, right = np.empty((g, g)), np.empty(g)
@@ -103,7 +103,7 @@ def start_of(trace: Trace, flat: tuple[int, ...], model: Matrices, experiment: E
 
     Raises
     ------
-    Stopped : the laws have no density at theta.
+    Stopped : the distributions have no density at theta.
     SamplingError : the data do not tell some flat component.
     """
     mean = model.m[:, None]
@@ -182,7 +182,7 @@ def slopes(trace: Trace, form: LinearGaussian) -> Slopes:
 
 
 def _culprit(trace: Trace, law: str, parameter: Expr) -> Location:
-    """Where the law is written that has no derivative in the parameter."""
+    """Where the distribution is written that has no derivative in the parameter."""
     sites = {
         "initial": trace.initial, "transition": trace.transition,
         "observation": trace.observations,
@@ -202,7 +202,7 @@ def check_free(trace: Trace, found: Slopes, free: np.ndarray) -> None:
 
     Raises
     ------
-    ArgumentError : naming the parameter, the law and the reason.
+    ArgumentError : naming the parameter, the distribution and the reason.
     """
     for p, (reason, where) in found.refused.items():
         if free[p]:
@@ -222,7 +222,7 @@ def score(
 
     Raises
     ------
-    Stopped : the laws have no density at theta.
+    Stopped : the distributions have no density at theta.
     """
     flat, adjoint = program.room(experiment.steps, filled=False)
     increments = np.empty(experiment.steps)
@@ -304,7 +304,8 @@ class KalmanModel(Scored):
 
         Raises
         ------
-        SamplingError : the laws have no density at theta; names the step and the parameters.
+        SamplingError : the distributions have no density at theta; names the step and the
+            parameters.
         """
         d, k, steps = (
             len(self.trace.state_symbols), len(self.trace.observation_symbols), experiment.steps
@@ -331,7 +332,8 @@ class KalmanModel(Scored):
 
         Raises
         ------
-        SamplingError : the laws have no density at theta; names the step and the parameters.
+        SamplingError : the distributions have no density at theta; names the step and the
+            parameters.
         """
         return self._smooth(experiment, theta)[0]
 
@@ -512,6 +514,6 @@ def kalman_filter(
     Raises
     ------
     ArgumentError : the model is not linear and Gaussian.
-    SamplingError : the laws have no density at theta.
+    SamplingError : the distributions have no density at theta.
     """
     return _applicable(source).filter(experiment, theta)

@@ -1,6 +1,6 @@
 """A linear Gaussian model in numbers: its matrices, and what the kernels make of them, smoothed
 moments, disturbances and draws (`codegen/kernels/kalman/smoother.py`); and what to say where its
-laws have no density.
+distributions have no density.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 "extended" and "unscented" are filters, and smooth as Rauch, Tung and Striebel (1965) do, with what
 each filter made linear (Särkkä 2008, "Unscented Rauch-Tung-Striebel smoother", *IEEE Transactions
-on Automatic Control* 53). "laplace" is the Gaussian law round the mode of all states together; as a
-filter it is that of the data up to each row, so that T rows cost T (T + 1) / 2.
+on Automatic Control* 53). "laplace" is the Gaussian distribution round the mode of all states
+together; as a filter it is that of the data up to each row, so that T rows cost T (T + 1) / 2.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ class ApproximateKalman:
 
         Raises
         ------
-        ArgumentError : predictions need moments of the observations, which some law has not.
+        ArgumentError : predictions need moments of the observations, which some distribution has
+            not.
         SamplingError : the approximation is not finite.
         """
         given = theta, e.y, e.seen, e.u
@@ -162,7 +163,7 @@ class ApproximateKalman:
         return mode
 
     def _laplace(self, e: Experiment, theta: np.ndarray) -> FilterMoments:
-        """The law of x_t round the mode given the data up to t, for each t."""
+        """The distribution of x_t round the mode given the data up to t, for each t."""
         steps, d = e.steps, len(self.problem.trace.state_symbols)
         out = FilterMoments(
             np.empty(steps), np.empty((steps, d)), np.empty((steps, d, d)), np.empty((steps, d)),

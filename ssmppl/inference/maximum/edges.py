@@ -1,7 +1,7 @@
 """Parameters whose maximum is at an edge of their support: a variance at zero, a share at one.
 
 There the score need not vanish, nor is there an interval about the estimate; the other parameters
-have their usual law given that one (Self and Liang 1987, "Asymptotic properties of maximum
+have their usual distribution given that one (Self and Liang 1987, "Asymptotic properties of maximum
 likelihood estimators and likelihood ratio tests under nonstandard conditions", *JASA* 82). An edge
 lies at infinity on the unconstrained scale. So an estimate is taken to be there if the objective
 nowhere falls on the way out, is not much higher at its end, and falls inwards without rising

@@ -116,7 +116,7 @@ class FiniteSteps:
     def _density(
         self, laws: list[tuple[Histories, np.ndarray, np.ndarray]], at: np.ndarray
     ) -> tuple[float, np.ndarray]:
-        """(Q, its derivatives) at theta' of the laws of the states at another theta."""
+        """(Q, its derivatives) at theta' of the distributions of the states at another theta."""
         trace = self.setup.problem.trace
         place = {s: i for i, s in enumerate(trace.parameter_symbols)}
         total, gradient = 0.0, np.zeros(len(place))

@@ -10,14 +10,14 @@ on the unconstrained scale; parameters and states are resampled together, and th
 are left begin the next pass. As the steps vanish the particles gather where the likelihood is
 highest.
 
-Numbers that act in the initial law alone step at the first row only, which the model itself tells
-(`analysis/proposals/perturbed.py`); those that act nowhere stay. Several experiments are passed
-over one after another with the same particles, whose parameters all of them share.
+Numbers that act in the initial distribution alone step at the first row only, which the model
+itself tells (`analysis/proposals/perturbed.py`); those that act nowhere stay. Several experiments
+are passed over one after another with the same particles, whose parameters all of them share.
 
 At the end of a pass the particles lean to the last rows. Averaged over all rows of a pass they do
 not, to first order: the filtered mean of a random walk is a weighted mean of what the rows say
 whose weights, over a whole period, are the same for each row. So the iterates are means over rows;
-those of the initial law's numbers are the particles' means at the end.
+those of the initial distribution's numbers are the particles' means at the end.
 
 What is left, all runs may share: steps that have not vanished, a ridge not yet climbed. How the
 ends differ does not tell it. So from the ends the top itself is looked for, by estimates of the
@@ -236,7 +236,8 @@ def climb(setup: Maximization, method: IF2) -> Ascent:
 
     Raises
     ------
-    ArgumentError : a setting does not apply; no particle can be drawn from the initial law.
+    ArgumentError : a setting does not apply; no particle can be drawn from the initial
+        distribution.
     SamplingError : the likelihood cannot be evaluated where any of the runs ended.
     """
     setup.problem.proposal("bootstrap")

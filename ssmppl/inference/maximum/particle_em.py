@@ -13,8 +13,8 @@ filter's estimate of the likelihood, is unbiased for p(y) E[S | y] (Del Moral 20
 weighed by their Z, and the ratio's own bias is taken off by the jackknife (Quenouille 1956):
 weights R / (R - 1) Z_r / sum Z - 1 / (R (R - 1)).
 
-With M fixed the iterates end in a stationary law round the limit, which they near by the slow
-factors of EM. The estimate is the fixed point of the regression of the later iterates on those
+With M fixed the iterates end in a stationary distribution round the limit, which they near by the
+slow factors of EM. The estimate is the fixed point of the regression of the later iterates on those
 before them, on the unconstrained scale, over independent chains from dispersed starts: no more
 than their mean where they have come to rest, and where they have not, corrected for what is left
 of the way. Its error is estimated by the jackknife over chains.
@@ -45,8 +45,8 @@ def climb(setup: Maximization, method: ParticleEM) -> Ascent:
 
     Raises
     ------
-    ArgumentError : a parameter cuts off the support of a law, so that given the states it cannot
-        move; names the line.
+    ArgumentError : a parameter cuts off the support of a distribution, so that given the states it
+        cannot move; names the line.
     SamplingError : the filter dies out.
     """
     need_density(setup.problem.trace, "ParticleEM", "maximize")

@@ -411,9 +411,9 @@ class IF2:
     steps on the unconstrained scale, smaller ones in each pass.
 
     The transition is only simulated: it may have no density (deterministic components, discrete
-    states) and no derivatives. Parameters that act in the initial law alone are found in the model
-    and take their step at the first row only. Several experiments are passed over one after
-    another.
+    states) and no derivatives. Parameters that act in the initial distribution alone are found in
+    the model and take their step at the first row only. Several experiments are passed over one
+    after another.
 
     Parameters
     ----------
@@ -423,8 +423,8 @@ class IF2:
         geometrically, from row to row. 1: no cooling.
     perturbation : standard deviation of a step at the beginning, on the unconstrained scale (of log
         theta, for a positive parameter): one number, or by the names of parameters. Those that are
-        not named have 0.02. A parameter of the initial law alone has the root of the number of rows
-        times as much, at most ten times, unless it is named.
+        not named have 0.02. A parameter of the initial distribution alone has the root of the
+        number of rows times as much, at most ten times, unless it is named.
     starts : number of runs, the first at the start, the others dispersed round it; or a list of
         their parameter values. The top is looked for from the end of highest log-likelihood, or
         from the mean of those that agree with it where that is higher still.
@@ -494,7 +494,7 @@ class KalmanSmoother:
     Parameters
     ----------
     proposal : "kalman", exact; or an approximation for states driven by Gaussian noise: "laplace",
-        the Gaussian law round the mode of all states together (Tierney and Kadane 1986),
+        the Gaussian distribution round the mode of all states together (Tierney and Kadane 1986),
         "extended", or "unscented" (Julier and Uhlmann 1997; Särkkä 2008).
     """
 
@@ -515,8 +515,8 @@ class FFBSi:
     Parameters
     ----------
     kernel : how the index of x_t is drawn given x_{t+1}: "exact", with all N weights; "rejection",
-        the same law by rejection sampling with early stopping (Douc et al. 2011; Taghavi et al.
-        2013), where the transition density has a bound; "mcmc" (Bunch and Godsill 2013);
+        the same distribution by rejection sampling with early stopping (Douc et al. 2011; Taghavi
+        et al. 2013), where the transition density has a bound; "mcmc" (Bunch and Godsill 2013);
         "genealogy", the filter's own ancestors, which all meet in one soon; "auto".
     moves : Metropolis-Hastings steps for each index of "mcmc".
     proposal, resampling, ess_threshold, rescue : of the particle filter, as in `log_likelihood`.

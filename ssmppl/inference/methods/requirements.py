@@ -1,4 +1,4 @@
-"""Methods that need the density of the states' laws, where a covariance leaves none."""
+"""Methods that need the density of the states' distributions, where a covariance leaves none."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def need_density(trace: Trace, method: str, verb: str) -> None:
 
     Raises
     ------
-    ArgumentError : a covariance is singular; names the law, and what needs no density.
+    ArgumentError : a covariance is singular; names the distribution, and what needs no density.
     """
     reason = singular_covariance(trace)
     if reason is None:

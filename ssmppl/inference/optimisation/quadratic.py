@@ -12,7 +12,7 @@ of all F parameters, and two things are different.
 
 Estimates Z of a likelihood are unbiased; their logs are too low by half their variance, which is
 not the same everywhere and would move the top. So the quadratic q is fitted to Z itself, by the
-estimating equation of a law whose standard deviation is in proportion to its mean,
+estimating equation of a distribution whose standard deviation is in proportion to its mean,
 
     sum_j x_j (Z_j / exp(q(u_j)) - 1) = 0,    x_j the monomials at u_j,
 

@@ -7,7 +7,8 @@ a bias of order 1 / N; N is the number of particles.
 The kernel says how the index of x_t is drawn given x_{t+1}:
 
 * "exact": with all N weights;
-* "rejection": by rejection sampling with early stopping, the same law (Douc et al. 2011; Taghavi et
+* "rejection": by rejection sampling with early stopping, the same distribution (Douc et al. 2011;
+Taghavi et
   al. 2013), where the transition density is bounded;
 * "mcmc": by Metropolis-Hastings steps from the filter's own ancestor (Bunch and Godsill 2013);
 * "genealogy": the filter's own ancestors (Kitagawa 1996): one pass, but all paths soon meet in one.

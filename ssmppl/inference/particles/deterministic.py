@@ -3,9 +3,9 @@
 Output-error models, that is simulators with noisy sensors (Ljung 1999, "System identification",
 section 4.3), and observation-driven models, whose states follow from the observations before them
 (Cox 1981, "Statistical analysis of time series: some recent developments"), such as GARCH. All
-initial laws and transitions are Dirac, and the likelihood is the product of the densities of the
-observations along the one trajectory. Its gradient goes along with it, by the sensitivities of
-`analysis/score.py`.
+initial distributions and transitions are Dirac, and the likelihood is the product of the densities
+of the observations along the one trajectory. Its gradient goes along with it, by the sensitivities
+of `analysis/score.py`.
 """
 
 from __future__ import annotations
@@ -118,8 +118,8 @@ class Deterministic(Scored):
 
         Raises
         ------
-        ArgumentError : the states go through a function without a derivative, or a law's support,
-            or the law by steps, depends on a free parameter.
+        ArgumentError : the states go through a function without a derivative, or a distribution's
+            support, or the distribution by steps, depends on a free parameter.
         """
         data = tuple(experiments)
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)

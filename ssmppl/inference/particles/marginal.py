@@ -201,7 +201,7 @@ def draw_given(
 
     Raises
     ------
-    SamplingError : the laws of z have no density given some path.
+    SamplingError : the distributions of z have no density given some path.
     """
     m, steps, _ = paths.shape
     width = max(1, MOST_VALUES // steps)
@@ -354,8 +354,8 @@ class _Law:
         self._rows, self._moments = range(0), (np.empty(0), np.empty(0))
 
     def alike(self, x: np.ndarray) -> list[np.ndarray]:
-        """Indices of trajectories, of new values (D', M), under the same law of (coupled x, z): all
-        of them, or where it reads new values, those that agree in these."""
+        """Indices of trajectories, of new values (D', M), under the same distribution of (coupled
+        x, z): all of them, or where it reads new values, those that agree in these."""
         if not self.read:
             return [np.arange(x.shape[1])]
         _, which = np.unique(x[self.read], axis=1, return_inverse=True)
@@ -375,8 +375,8 @@ class _Law:
         return self._moments[0][at], self._moments[1][at]
 
     def step(self, t: int, x: np.ndarray) -> _Step:
-        """The law of row t + 1 given the particles of row t, and new values (D',) where it reads
-        any."""
+        """The distribution of row t + 1 given the particles of row t, and new values (D',) where it
+        reads any."""
         given, n = self.found.given, self.system.particles.shape[2]
         row = slice(t + 1, t + 2)
         values = {s: at_rows(v, row) for s, v in self.values.items()}

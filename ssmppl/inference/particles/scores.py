@@ -167,8 +167,8 @@ def complete_scores(problem: Problem, fixed: Collection[str] = ()) -> CompleteSc
 
     Raises
     ------
-    ArgumentError : Fisher's identity does not hold in some parameter, as the support of a law, or
-        the law by steps, depends on it; names the line.
+    ArgumentError : Fisher's identity does not hold in some parameter, as the support of a
+        distribution, or the distribution by steps, depends on it; names the line.
     """
     need_density(problem.trace, "the score by particles", "score")
     symbols = [s for s in problem.trace.parameter_symbols if s.data[1] not in fixed]

@@ -126,7 +126,8 @@ def _moderate(site: Site, known: dict[Expr, float]) -> np.ndarray:
 def _centres(
     d: Distribution, mean: np.ndarray, known: dict[Expr, float]
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Centre and spread of a law, each of the mean's shape: by quartiles, then by moments."""
+    """Centre and spread of a distribution, each of the mean's shape: by quartiles, then by
+    moments."""
 
     def numbers(values: Any) -> np.ndarray:
         return np.broadcast_to(evaluate(array(values), known), mean.shape).astype(float)

@@ -166,7 +166,8 @@ def averaged_density(
 
 
 def explained(error: ArgumentError, space: Space) -> ArgumentError:
-    """The error of `finite_point`, with the law that has no density at the space's own point."""
+    """The error of `finite_point`, with the distribution that has no density at the space's own
+    point."""
     none = law_without_density_at(space.problem.trace, space.theta)
     if none is None:
         return error

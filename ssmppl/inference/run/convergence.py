@@ -6,10 +6,10 @@ folding, and localization: an improved R-hat for assessing convergence of MCMC",
 the median (section 4.2), and the effective sample size of the ranks (section 4.1 with equations (8)
 to (11)).
 
-Trajectories: particle Gibbs leaves the right law invariant whatever its update rate, but a row that
-never changes has not been sampled: paths of a conditional particle filter meet in the reference,
-the earlier the row the likelier (Lindsten, Jordan and Schön 2014, section 3). How often the states
-change, row by row, is their diagnostic.
+Trajectories: particle Gibbs leaves the right distribution invariant whatever its update rate, but a
+row that never changes has not been sampled: paths of a conditional particle filter meet in the
+reference, the earlier the row the likelier (Lindsten, Jordan and Schön 2014, section 3). How often
+the states change, row by row, is their diagnostic.
 """
 
 from __future__ import annotations
@@ -216,7 +216,8 @@ def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) 
 
 
 def random_components(problem: Problem, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """(T, D) each: which components have a law of their own, and which of them are discrete."""
+    """(T, D) each: which components have a distribution of their own, and which of them are
+    discrete."""
     trace = problem.trace
     place = {s: k for k, s in enumerate(trace.state_symbols)}
     free = np.zeros((steps, len(place)), dtype=bool)

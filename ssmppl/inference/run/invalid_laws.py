@@ -1,5 +1,5 @@
-"""Which argument of a law left its range and what to write so that it cannot; which law has no
-density at some parameters; and sums of log densities.
+"""Which argument of a distribution left its range and what to write so that it cannot; which
+distribution has no density at some parameters; and sums of log densities.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
 
 
 def law_without_density_at(trace: Trace, theta: np.ndarray) -> tuple[str, str, Location] | None:
-    """Which law has no density at theta (P,) whatever the states are, a spread being none there:
-    what was found, the fix, and the user's line. None where every law has one, as far as the
-    parameters alone tell.
+    """Which distribution has no density at theta (P,) whatever the states are, a spread being none
+    there: what was found, the fix, and the user's line. None where every distribution has one, as
+    far as the parameters alone tell.
     """
     known = dict(zip(trace.parameter_symbols, theta.tolist(), strict=True))
     for sites in (trace.observations, trace.transition, trace.initial):
@@ -85,7 +85,7 @@ def _covariance(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, s
 
 
 def _laws_in(law: Distribution) -> list[Distribution]:
-    """The law, and those that it is made of: of a truncated one the base alone."""
+    """The distribution, and those that it is made of: of a truncated one the base alone."""
     base = getattr(law, "base", None)
     inside = [*getattr(law, "components", ()), *([] if base is None else [base])]
     own = [] if isinstance(law, Truncated) else [law]
@@ -95,7 +95,7 @@ def _laws_in(law: Distribution) -> list[Distribution]:
 def _of_one(
     law: Distribution, values: Mapping[Expr, float], might: list[tuple[str, str]]
 ) -> tuple[str, str] | None:
-    """As `out_of_range`, without the laws inside; `might` gets what may be at fault."""
+    """As `out_of_range`, without the distributions inside; `might` gets what may be at fault."""
     name = type(law).__name__
     for argument, (low, high, strict) in law.ranges.items():
         called = re.sub(r"^weight_(\d+)$", r"weights[\1]", argument.rstrip("_"))

@@ -39,8 +39,8 @@ def component_dims(name: str, values: np.ndarray, leading: int) -> list[str]:
 
 
 def model_attributes(trace: Trace) -> dict[str, Any]:
-    """The attributes of every result that are about the model: its name, and which of its laws
-    are approximations of what was declared, as that of a non-linear `SDE`."""
+    """The attributes of every result that are about the model: its name, and which of its
+    distributions are approximations of what was declared, as that of a non-linear `SDE`."""
     told = "; ".join(f"{name}: {text}" for name, text in trace.approximations.items())
     return {"model": trace.name} | ({"approximate_distributions": told} if told else {})
 

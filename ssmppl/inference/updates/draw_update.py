@@ -5,9 +5,9 @@ The draw leaves the exact conditional invariant, whatever path it takes:
 - conjugate part, kept if it lies within the bounds and passes the correction: accept-reject, an
   independent draw from the conditional itself;
 - after `MAX_TRIES` refusals a sweep of slice steps instead, or after `LOOK` of them that had next
-  to no chance, as where many data sets share a parameter of their initial law. How many refusals
-  there were, and what was refused, does not depend on the current value, so this mixes two kernels
-  that both leave the conditional invariant;
+  to no chance, as where many data sets share a parameter of their initial distribution. How many
+  refusals there were, and what was refused, does not depend on the current value, so this mixes two
+  kernels that both leave the conditional invariant;
 - a correction without a known upper bound, or one that does not separate and is taken from the log
   joint density: a Metropolis-Hastings step that proposes from the conjugate part, then always a
   sweep of slice steps, so that no value is held for long;

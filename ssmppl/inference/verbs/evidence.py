@@ -3,8 +3,9 @@
 The estimate of the likelihood by a particle filter is a density over the parameters *and* the
 filter's random numbers: the posterior draws of particle Metropolis-Hastings, with the estimates
 that they were accepted with, are draws from it (Andrieu, Doucet and Holenstein 2010), and fresh
-estimates at draws of any other law are draws from that law on the same space. Bridge sampling
-between the two is therefore consistent for every number of particles, which only sets its error.
+estimates at draws of any other distribution are draws from that distribution on the same space.
+Bridge sampling between the two is therefore consistent for every number of particles, which only
+sets its error.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def evidence(
     ------
     ArgumentError : a free parameter has an improper prior, so that p(y) has no meaning; or there
         are too few draws for the number of parameters.
-    SamplingError : the likelihood is zero wherever the law bridged to puts its points.
+    SamplingError : the likelihood is zero wherever the distribution bridged to puts its points.
     """
     for name, value, least in (("draws", draws, 4), ("warmup", warmup, 0), ("chains", chains, 1)):
         check_count(name, value, least)
@@ -308,7 +309,7 @@ def _log_densities(
     space: Space, method: PMMH | MetropolisHastings, root: np.random.SeedSequence,
     piece: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:  # fmt: skip
-    """log p~ at points z of the law bridged to, with fresh estimates of the likelihood."""
+    """log p~ at points z of the distribution bridged to, with fresh estimates of the likelihood."""
     problem, out = space.problem, np.full(len(piece[0]), -np.inf)
     for i, (z, number) in enumerate(zip(*piece, strict=True)):
         theta, log_prior = space.parameters(z)

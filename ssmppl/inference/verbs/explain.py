@@ -259,7 +259,7 @@ def _laws(sites: dict[str, Site], auxiliary: Collection[str] = ()) -> list[tuple
 
 
 def _loops(trace: Trace) -> list[tuple[str, str]]:
-    """What the names of loops in the laws stand for, and of how many steps they are."""
+    """What the names of loops in the distributions stand for, and of how many steps they are."""
     sites = (trace.parameters, trace.initial, trace.transition, trace.observations)
     laws = [s.distribution for group in sites for s in group.values()]
     waiting = [e for law in reversed(laws) for e in reversed(law.expressions())]
@@ -282,7 +282,8 @@ def _loops(trace: Trace) -> list[tuple[str, str]]:
 
 
 def _cut(law: str) -> str:
-    """A law short enough to be read: one whose mean is a loop of small steps fills pages."""
+    """A distribution short enough to be read: one whose mean is a loop of small steps fills
+    pages."""
     if len(law) <= LONGEST_LAW:
         return law
     head = law[: law.rindex(" ", 0, LONGEST_LAW)]
@@ -367,7 +368,7 @@ def _labels(trace: Trace, experiments: Sequence[Experiment]) -> tuple[tuple[str,
 def _unread(
     columns: Sequence[str], experiments: Sequence[Experiment]
 ) -> tuple[tuple[str, str], ...]:
-    """Columns that no law reads, one of which may have been meant to name the rows."""
+    """Columns that no distribution reads, one of which may have been meant to name the rows."""
     if not columns:
         return ()
     named = ", ".join(columns[:MOST_NAMED]) + (", ..." if len(columns) > MOST_NAMED else "")

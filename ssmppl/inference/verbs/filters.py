@@ -88,7 +88,7 @@ def particle_filter(
         * ``y_predicted``, ``y_predicted_sd``: moments of y_t given y_1:t-1;
         * ``y_predicted_quantile``: quantiles of the same, last dim `quantile`, from one y_t drawn
           of each particle that is predicted: of counts whole numbers, of few particles as rough as
-          any quantiles of so many draws; NaN where a law is not defined;
+          any quantiles of so many draws; NaN where a distribution is not defined;
         * ``y_pit``: P(Y_t <= y_t given y_1:t-1), randomised for discrete channels; NaN where
           missing or undefined;
         * ``ess``: effective sample size (Kong, Liu and Wong 1994);
@@ -273,15 +273,16 @@ def kalman_filter(
     proposal : "kalman", exact, for linear Gaussian models, which "auto" takes unless the model
         calls a simulator: then "extended". Or, where states are driven by Gaussian
         noise, one of the approximations "extended" (the update is the mode of each row),
-        "unscented" (Julier and Uhlmann 1997) and "laplace" (the law round the mode of all states
-        given the data up to each row, whose cost grows with the square of the rows).
+        "unscented" (Julier and Uhlmann 1997) and "laplace" (the distribution round the mode of all
+        states given the data up to each row, whose cost grows with the square of the rows).
     quantiles : levels of the quantiles of states and predictions.
 
     Returns
     -------
     Dataset, or a list of them for several experiments
         As of `particle_filter`, with one `draw` and without `ess`. Everything is exact with
-        "kalman"; else all laws are Gaussian approximations, and the attribute `approximate` is 1.
+        "kalman"; else all distributions are Gaussian approximations, and the attribute
+        `approximate` is 1.
 
     Raises
     ------
@@ -377,8 +378,8 @@ def forward_filter(
         As of `particle_filter`, with one `draw` and without `ess`, everything exact; and for each
         state x ``x_probability``: P(x_t = value given y_1:t), last dim `x_value`, whose coordinate
         holds the values. ``y_predicted_quantile`` inverts the distribution function of the mixture;
-        it is NaN for Wishart laws, whose components have none in closed form, and for laws of your
-        own without `@law.quantile`.
+        it is NaN for Wishart distributions, whose components have none in closed form, and for
+        distributions of your own without `@distribution.quantile`.
 
     Raises
     ------
@@ -414,7 +415,7 @@ def forward_filter(
 def _probabilities(
     exact: HiddenMarkov, law: np.ndarray, dataset: xr.Dataset
 ) -> dict[str, xr.DataArray]:
-    """Of each state's values, from the laws (T, K) of their combinations."""
+    """Of each state's values, from the distributions (T, K) of their combinations."""
     import xarray as xr
 
     out = {}

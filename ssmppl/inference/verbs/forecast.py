@@ -65,8 +65,9 @@ def forecast(
 ) -> xr.Dataset:
     """Draws of the states and observations after the last row of the data.
 
-    Each posterior draw of the parameters and of x_T is continued by the model's laws: one draw of
-    p(x_{T+1:T+H}, y_{T+1:T+H} | y_{1:T}) each. At known parameters x_T is drawn by `smooth`.
+    Each posterior draw of the parameters and of x_T is continued by the model's distributions: one
+    draw of p(x_{T+1:T+H}, y_{T+1:T+H} | y_{1:T}) each. At known parameters x_T is drawn by
+    `smooth`.
 
     Parameters
     ----------
@@ -348,7 +349,7 @@ def _gain(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Of each channel jointly Gaussian and measured in part at row t: the missing components (m,),
     the measured ones (s,), and C_ms C_ss^-1 (n, m, s) for each row of theta (n, P) and x (n, D).
-    Other joint laws are measured as a whole or not at all."""
+    Other joint distributions are measured as a whole or not at all."""
     values: dict[Expr, np.ndarray] = {symbol("time", "t"): np.array(float(t))}
     values |= zip(trace.parameter_symbols, theta.T, strict=True)
     values |= zip(trace.state_symbols, x.T, strict=True)

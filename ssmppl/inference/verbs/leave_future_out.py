@@ -7,8 +7,9 @@ draws of p(theta | y_{1:L}) serve the rows after L too, weighted by
 
     w_t(theta) = p(y_{L+1:t} | y_{1:L}, theta),
 
-smoothed by a generalised Pareto law (Vehtari, Simpson, Gelman, Yao and Gabry 2024); where its shape
-says that the weights can no longer be trusted, the model is sampled anew given the rows so far.
+smoothed by a generalised Pareto distribution (Vehtari, Simpson, Gelman, Yao and Gabry 2024); where
+its shape says that the weights can no longer be trusted, the model is sampled anew given the rows
+so far.
 """
 
 from __future__ import annotations
@@ -195,7 +196,8 @@ def _row(
 
 
 def _smoothed(log_w: np.ndarray) -> tuple[np.ndarray, float]:
-    """Normalised log weights, their tail smoothed, and the shape of the Pareto law that did it."""
+    """Normalised log weights, their tail smoothed, and the shape of the Pareto distribution that
+    did it."""
     top, n = log_w.max(), len(log_w)
     if not np.isfinite(top):
         return log_w, np.inf

@@ -71,10 +71,10 @@ def log_likelihood(
         better proposals; "auto" tries them.
         "tempered" takes a sharp likelihood in by degrees: at each row particles are weighed by
         rising powers of the observation's density, resampled, and moved by Metropolis steps between
-        them (Herbst and Schorfheide 2019), for continuous states of any law and observations that
-        no derivative is known of; a pilot of its own random numbers fixes powers and steps for each
-        estimate. It costs tens of times what "bootstrap" does, and "auto" tries it where no
-        guided proposal is derived and others tell log Z to no better than 1.2.
+        them (Herbst and Schorfheide 2019), for continuous states of any distribution and
+        observations that no derivative is known of; a pilot of its own random numbers fixes powers
+        and steps for each estimate. It costs tens of times what "bootstrap" does, and "auto" tries
+        it where no guided proposal is derived and others tell log Z to no better than 1.2.
         "laplace", "extended" and "unscented" are approximations without particles or random
         numbers, for models whose states are driven by Gaussian noise: Laplace's, at the mode of
         all states together (Tierney and Kadane 1986), an extended Kalman filter, whose update is

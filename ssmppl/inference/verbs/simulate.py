@@ -104,7 +104,7 @@ def simulate(
 
 
 def check_drawable(traced: Trace) -> None:
-    """Refuse a model whose x_1 has no proper law, or an observation no sampler.
+    """Refuse a model whose x_1 has no proper distribution, or an observation no sampler.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def check_samplers(traced: Trace) -> None:
 
     Raises
     ------
-    ModelError : naming the law and its line.
+    ModelError : naming the distribution and its line.
     """
     for site in traced.observations.values():
         if not site.distribution.drawable:
@@ -132,11 +132,11 @@ def check_samplers(traced: Trace) -> None:
 
 
 def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) -> None:
-    """Refuse draws that are nan: some law left its domain.
+    """Refuse draws that are nan: some distribution left its domain.
 
     Raises
     ------
-    SamplingError : naming the first such step, the quantity and its law's line.
+    SamplingError : naming the first such step, the quantity and its distribution's line.
     """
     parts = ((states, traced.state_symbols, traced.transition),
              (observations, traced.observation_symbols, traced.observations))  # fmt: skip

@@ -1,6 +1,6 @@
 """The verb `smooth`: states given all of the data, at known parameters.
 
-A method finds draws from the joint law of the states, or moments of the marginal ones
+A method finds draws from the joint distribution of the states, or moments of the marginal ones
 (`SmoothedStates`); `METHODS` has the function of each, under the class of its settings.
 """
 
@@ -337,7 +337,7 @@ def smooth(
         FFBSi; the attribute `method_chosen` says why.
     particles : number N; None: 1000, and for PGAS its own. An exact smoother, where `method` is
         left to the model, does without. Moments have a bias of order 1 / N, but
-        those of PGAS, whose chain has the right law for every N >= 2.
+        those of PGAS, whose chain has the right distribution for every N >= 2.
     trajectories : number M of draws; None: exact moments from an exact smoother, and 1000 draws
         from FFBSi and PGAS.
     proposal : in place of `method`: "laplace", "extended" or "unscented", as of `kalman_filter`, or

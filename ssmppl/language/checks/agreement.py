@@ -1,10 +1,11 @@
-"""Whether what a user declared of a law agrees with its density, by quadrature and by a test.
+"""Whether what a user declared of a distribution agrees with its density, by quadrature and by a
+test.
 
 A continuous support is mapped to the line (x = sinh s; lower + e^s; a logistic function of s
 between two bounds), where densities with the heavy tails and the integrable singularities of the
-usual laws fall off exponentially, and cut at the mode, at steps from it that double, and at the
-draws. On each piece Gauss-Legendre rules of 10 and of 20 nodes are compared, and pieces halved
-until they agree.
+usual distributions fall off exponentially, and cut at the mode, at steps from it that double, and
+at the draws. On each piece Gauss-Legendre rules of 10 and of 20 nodes are compared, and pieces
+halved until they agree.
 The test of the draws is Kolmogorov's, with the exact distribution of its statistic for their number
 (Simard and L'Ecuyer 2011, *J. Statist. Software* 39(11)).
 """
@@ -38,13 +39,13 @@ _RULES = [np.polynomial.legendre.leggauss(n) for n in (10, 20)]
 
 @dataclass(frozen=True)
 class Agreement:
-    """What was found of a law; all of it within its tolerance.
+    """What was found of a distribution; all of it within its tolerance.
 
     Attributes
     ----------
     total : integral, or sum, of the density over the support.
-    p_value : of the draws; None where the law has no sampler.
-    mean, variance : by integration; without a meaning where the law has none.
+    p_value : of the draws; None where the distribution has no sampler.
+    mean, variance : by integration; without a meaning where the distribution has none.
     lines : what was compared, in words.
     """
 

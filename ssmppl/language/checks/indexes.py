@@ -1,4 +1,4 @@
-"""Elements of arrays that a state or a parameter chooses: its law has to keep within them.
+"""Elements of arrays that a state or a parameter chooses: its distribution has to keep within them.
 
 What inputs choose is checked where there are data.
 """
@@ -21,7 +21,7 @@ MOST = 4096  # combinations of values that are tried
 
 
 class _Values:
-    """What the laws of one quantity give it."""
+    """What the distributions of one quantity give it."""
 
     def __init__(self) -> None:
         self.found: set[float] = set()
@@ -29,7 +29,7 @@ class _Values:
         self.complete = True  # whether `found` are all
 
     def add(self, kind: str, lower: Expr, upper: Expr) -> None:
-        """Those of a law with this support; of points, `_follow` adds them."""
+        """Those of a distribution with this support; of points, `_follow` adds them."""
         if kind == "integers" and lower.op == upper.op == "const":
             self.unbounded |= not upper.data - lower.data < MOST
             self.complete &= not self.unbounded
@@ -41,8 +41,8 @@ class _Values:
 
 
 def check_indexes(trace: Trace) -> None:
-    """Raise for an index that may choose an element that does not exist, as far as the laws of the
-    states and parameters in it tell: it would silently be the last.
+    """Raise for an index that may choose an element that does not exist, as far as the
+    distributions of the states and parameters in it tell: it would silently be the last.
 
     Raises
     ------

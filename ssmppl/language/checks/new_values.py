@@ -2,7 +2,8 @@
 
 The functions of a model are traced in the order in which they were declared, and each may name what
 earlier ones have given: the symbols of a noisy quantity, the expression of a deterministic one. A
-quantity without an initial law is a draw of the step, which nothing but such arguments reads.
+quantity without an initial distribution is a draw of the step, which nothing but such arguments
+reads.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ class NewValues:
     def draws_of_step(
         self, initial: Mapping[str, Site], transition: Mapping[str, Site]
     ) -> dict[str, Site]:
-        """Initial laws of what has none, by name: at the first row, where it does not exist, 0. A
-        deterministic one is but a name for its value, and left out."""
+        """Initial distributions of what has none, by name: at the first row, where it does not
+        exist, 0. A deterministic one is but a name for its value, and left out."""
         out = {}
         for name, site in transition.items():
             if name in initial or isinstance(site.distribution, Dirac):
@@ -78,8 +79,8 @@ class NewValues:
     def ordered(
         self, initial: Mapping[str, Site], transition: Mapping[str, Site]
     ) -> dict[str, Site]:
-        """Transitions in the order of the initial laws, or where new values are read, in that of
-        the functions."""
+        """Transitions in the order of the initial distributions, or where new values are read, in
+        that of the functions."""
         names = [n for n in transition if n in initial] if self.read else initial
         return {n: transition[n] for n in names}
 
@@ -87,7 +88,7 @@ class NewValues:
 def check_draws_of_step(
     initial: Mapping[str, Site], transition: Mapping[str, Site], new: NewValues
 ) -> None:
-    """Refuse a transition of what has no initial law, unless its new value is read."""
+    """Refuse a transition of what has no initial distribution, unless its new value is read."""
     for name, site in transition.items():
         if name not in initial and name not in new.read:
             raise ModelError(
@@ -221,7 +222,7 @@ DRAW = "draw of the step"  # the role of what has no initial law
 
 
 def names_given(returned: Any) -> Mapping[str, Any]:
-    """The laws that a function returned; none where it did not return any."""
+    """The distributions that a function returned; none where it did not return any."""
     if not isinstance(returned, Mapping):
         return {}
     return {n: d for n, d in returned.items() if isinstance(n, str)}

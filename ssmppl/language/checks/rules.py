@@ -1,4 +1,5 @@
-"""Rules on what a law may give: names, kinds of distributions, agreement of a state's laws."""
+"""Rules on what a distribution may give: names, kinds of distributions, agreement of a state's
+distributions."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ def a(role: str) -> str:
 
 
 def check_name(name: Any, role: str, where: Location) -> None:
-    """Names must be arguments that a law can have, and no dimension of results."""
+    """Names must be arguments that a distribution can have, and no dimension of results."""
     if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name):
         raise ModelError(
             f"{a(role)} has the name {name!r}, which no argument of a Python function can have",
@@ -72,7 +73,7 @@ def check_dims(
 def check_returned(
     returned: Any, role: str, function: str, where: Location
 ) -> dict[str, Distribution]:
-    """The laws by name."""
+    """The distributions by name."""
     if not isinstance(returned, Mapping) or not returned:
         found = "nothing" if returned is None else repr(returned)
         raise ModelError(
@@ -99,7 +100,7 @@ def check_returned(
 
 
 def check_law(name: str, distribution: Distribution, role: str) -> None:
-    """What may stand as a prior, as a law of states, as an observation."""
+    """What may stand as a prior, as a distribution of states, as an observation."""
     where = distribution.location
     kind = type(distribution).__name__
     if role == "prior" and isinstance(distribution, Dirac):
@@ -153,7 +154,8 @@ def check_read(
     name: str, distribution: Distribution, role: str, kinds: Collection[str],
     handed: Collection[Expr] = (),
 ) -> None:  # fmt: skip
-    """Refuse symbols of other kinds than the arguments of the function: another law kept them.
+    """Refuse symbols of other kinds than the arguments of the function: another distribution kept
+    them.
 
     handed : further symbols, in the new values that it asked for.
     """
@@ -172,9 +174,9 @@ def check_states(
     initial: Mapping[str, Any], transition: Mapping[str, Any], proposal: Mapping[str, Any],
     draws: Collection[str] = (),
 ) -> None:  # fmt: skip
-    """Every state has its laws, and they agree; arguments are sites by name.
+    """Every state has its distributions, and they agree; arguments are sites by name.
 
-    draws : names of those that are draws of a step: their initial laws are no user's.
+    draws : names of those that are draws of a step: their initial distributions are no user's.
     """
     for name, site in initial.items():
         if name not in transition:

@@ -1,5 +1,5 @@
 """What every distribution offers: parameters, support, log density, sampler, moments, and the facts
-about a law that analyses and the diagnosis ask for.
+about a distribution that analyses and the diagnosis ask for.
 
 All of it as expressions, so that one definition serves the interpreter, the analyses and the
 generated code. A sampler is an expression over the "random" nodes of `draws.py`.
@@ -45,7 +45,7 @@ class Support:
 
 @dataclass(frozen=True)
 class MeanLink:
-    """How the mean of a law is moved: by increments of one parameter, on a scale.
+    """How the mean of a distribution is moved: by increments of one parameter, on a scale.
 
     scale : "identity", "log", "logit", or "mean of the log".
     inverse : whether the parameter is a reciprocal, as a rate is, which falls where the mean grows.
@@ -58,7 +58,8 @@ class MeanLink:
 
 @dataclass(frozen=True)
 class VarianceLink:
-    """How the variance of a law is scaled: the parameter is in proportion to variance^power."""
+    """How the variance of a distribution is scaled: the parameter is in proportion to
+    variance^power."""
 
     parameter: str
     power: float
@@ -162,10 +163,10 @@ class Distribution:
 
     def in_range(self) -> ExprArray | None:
         """Whether the parameters that are no numbers allow a draw: element by element, or () for a
-        joint law; None where nothing has to be asked.
+        joint distribution; None where nothing has to be asked.
 
-        Ends of the range are let through: a spread of zero is a law at one point, and sums of
-        probabilities miss 0 and 1 by rounding.
+        Ends of the range are let through: a spread of zero is a distribution at one point, and sums
+        of probabilities miss 0 and 1 by rounding.
         """
         inside: ExprArray | None = None
         for name, (low, high, strict) in self.ranges.items():
@@ -201,26 +202,27 @@ class Distribution:
         return f"{type(self).__name__}({inside})"
 
     def inside(self) -> tuple[Distribution, ...]:
-        """The laws that this one is made of."""
+        """The distributions that this one is made of."""
         base = self.__dict__.get("base")
         return () if base is None else (base,)
 
     def undrawable(self, why: str) -> ModelError:
-        """The error of a law that is not `drawable` where it has to be."""
+        """The error of a distribution that is not `drawable` where it has to be."""
         return next(law for law in self.inside() if not law.drawable).undrawable(why)
 
     def expressions(self) -> list[Expr]:
-        """All that the law is made of: its parameters, and what else it holds."""
+        """All that the distribution is made of: its parameters, and what else it holds."""
         own = [e for p in self.parameters.values() for e in p.ravel()]
         return [*own, *(e for law in self.inside() for e in law.expressions())]
 
     def arguments(self) -> list[Expr]:
-        """What the user gave for the parameters of the law and of those inside of it."""
+        """What the user gave for the parameters of the distribution and of those inside of it."""
         own = [e for p in self.parameters.values() for e in p.ravel()]
         return [*own, *(e for law in self.inside() for e in law.arguments())]
 
     def rebuilt(self, parameters: Mapping[str, Any]) -> Distribution:
-        """The law of this family with these for its own `parameters`, at its place in the file."""
+        """The distribution of this family with these for its own `parameters`, at its place in the
+        file."""
         values = {**self.parameters, **parameters}
         return self._at_place(type(self)(**{n.rstrip("_"): array(v) for n, v in values.items()}))  # type: ignore[call-arg]
 
@@ -229,7 +231,7 @@ class Distribution:
         return new
 
     def element(self, index: tuple[int, ...]) -> Distribution:
-        """The law of one element of an elementwise law."""
+        """The distribution of one element of an elementwise distribution."""
         return self.rebuilt({n: a[index] for n, a in self.parameters.items()})
 
     # -- to be defined by each distribution
@@ -288,7 +290,7 @@ class Distribution:
 
     # -- what analyses make use of where it is known
     def location_and_scale(self) -> tuple[ExprArray, ExprArray] | None:
-        """(m, s) with X = m + s Z, the law of Z free of what is in m and s."""
+        """(m, s) with X = m + s Z, the distribution of Z free of what is in m and s."""
         return None
 
     def noise_free(self) -> ExprArray:
@@ -302,7 +304,7 @@ class Distribution:
     def truncated_moments(
         self, lower: ExprArray, upper: ExprArray
     ) -> tuple[ExprArray, ExprArray] | None:
-        """Mean and variance between bounds, in a form of the law's own."""
+        """Mean and variance between bounds, in a form of the distribution's own."""
         return None
 
     def rounded_inside(self, drawn: ExprArray) -> ExprArray:
@@ -310,7 +312,7 @@ class Distribution:
         return drawn
 
     def inverts(self) -> bool:
-        """Whether its quantiles, and those of the laws inside, have a formula."""
+        """Whether its quantiles, and those of the distributions inside, have a formula."""
         return all(law.inverts() for law in self.inside())
 
     def shares(self) -> tuple[str, list[Any]] | None:
@@ -385,9 +387,9 @@ class Distribution:
     def guarded_log_densities(self, value: ExprArray) -> ExprArray:
         """`log_densities`, and -inf outside the support.
 
-        Of a discrete law, and of others with `guards_range`, NaN where a parameter is out of its
-        range: a count of 0 takes no logarithm of it. The formulas of most continuous laws are NaN
-        there by themselves.
+        Of a discrete distribution, and of others with `guards_range`, NaN where a parameter is out
+        of its range: a count of 0 takes no logarithm of it. The formulas of most continuous
+        distributions are NaN there by themselves.
         """
         density = self._guarded_support(array(self.log_densities(value)), value)
         allowed = self.in_range() if self.discrete or self.guards_range else None
@@ -487,7 +489,7 @@ def misfit(
     name: str, error: TypeError, args: tuple[Any, ...], kwargs: dict[str, Any],
     positional: Sequence[str], by_name: Sequence[str] = (), called: str = "",
 ) -> ModelError:  # fmt: skip
-    """What a law says whose arguments do not fit: Python's error, and how it is written.
+    """What a distribution says whose arguments do not fit: Python's error, and how it is written.
 
     positional, by_name : its arguments; the latter are called `called`.
     """

@@ -1,9 +1,9 @@
-"""User-defined laws: `UserDefined`, made by what `@ssm.distribution` declares.
+"""User-defined distributions: `UserDefined`, made by what `@ssm.distribution` declares.
 
-The user's functions are run on symbols where the law stands in a model, once for each pattern of
-numbers among its arguments; what they gave, in placeholders for the value and the other arguments,
-is all that is kept. So the law is expressions like any other, and no function of the user's
-travels to other processes.
+The user's functions are run on symbols where the distribution stands in a model, once for each
+pattern of numbers among its arguments; what they gave, in placeholders for the value and the other
+arguments, is all that is kept. So the distribution is expressions like any other, and no function
+of the user's travels to other processes.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ MOST_LISTED = 64  # values of a discrete law that are listed, all else following
 
 
 def placeholder(name: str) -> Expr:
-    """What stands for an argument of the law in its forms."""
+    """What stands for an argument of the distribution in its forms."""
     return symbol("argument", name)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a law was declared; module and qualified name import it, if anything does."""
+    """Where a distribution was declared; module and qualified name import it, if anything does."""
 
     name: str
     location: Location
@@ -55,7 +55,7 @@ class Bounds:
 
     @property
     def values(self) -> np.ndarray | None:
-        """Of a discrete law between numbers not far apart, all that it may give."""
+        """Of a discrete distribution between numbers not far apart, all that it may give."""
         if not self.discrete or isinstance(self.lower, str) or isinstance(self.upper, str):
             return None
         few = self.upper - self.lower < MOST_LISTED
@@ -63,9 +63,9 @@ class Bounds:
 
 
 class UserDefined(Distribution):
-    """A law that a user wrote; its class has the name of the user's function.
+    """A distribution that a user wrote; its class has the name of the user's function.
 
-    patterns : of the law's shape, which of `forms` each component has.
+    patterns : of the distribution's shape, which of `forms` each component has.
     forms : by pattern of numbers among the arguments, the user's functions in `VALUE`,
         placeholders and, for a draw, random nodes.
     """
@@ -96,7 +96,7 @@ class UserDefined(Distribution):
         return [*super().expressions(), *own]
 
     def with_parameters(self, parameters: Mapping[str, ExprArray]) -> UserDefined:
-        """The law with other expressions for its arguments; numbers stay what they are."""
+        """The distribution with other expressions for its arguments; numbers stay what they are."""
         new = object.__new__(type(self))
         new.__dict__.update(self.__dict__)
         new._set(**parameters)
@@ -161,7 +161,7 @@ class UserDefined(Distribution):
         raise self.undrawable("something has to be drawn from it here")
 
     def undrawable(self, why: str) -> ModelError:
-        """The error of a law without a sampler that needs one."""
+        """The error of a distribution without a sampler that needs one."""
         name = self.origin.name
         return ModelError(
             f"{name} has no sampler, and {why}",
@@ -195,7 +195,7 @@ class UserDefined(Distribution):
         return array(sum(p * (k - mean) ** 2 for k, p in self._listed()))
 
     def _listed(self) -> list[tuple[float, ExprArray]]:
-        """Values and their probabilities, of a law with few values."""
+        """Values and their probabilities, of a distribution with few values."""
         values = self.bounds.values
         assert values is not None
         return [(k, array(ew("exp", self.log_densities(k)))) for k in values.tolist()]
@@ -250,7 +250,7 @@ class UserDefined(Distribution):
 
 @once
 def user_defined_class(name: str) -> type[UserDefined]:
-    """The class of the laws of this name."""
+    """The class of the distributions of this name."""
     return type(name, (UserDefined,), {"__doc__": f"{name}, as its user wrote it."})
 
 

@@ -1,7 +1,7 @@
-"""Mixture: one of several laws by a hidden choice, which is summed out (McLachlan and Peel 2000,
-"Finite mixture models"); ZeroInflated: a law of counts with more zeros than are its own (Lambert
-1992, "Zero-inflated Poisson regression, with an application to defects in manufacturing",
-*Technometrics* 34).
+"""Mixture: one of several distributions by a hidden choice, which is summed out (McLachlan and Peel
+2000, "Finite mixture models"); ZeroInflated: a distribution of counts with more zeros than are its
+own (Lambert 1992, "Zero-inflated Poisson regression, with an application to defects in
+manufacturing", *Technometrics* 34).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Mixture(Distribution):
 
     Parameters
     ----------
-    weights : (K,), not negative, of sum 1: numbers, ``[1 - p, p]``, or a parameter of law
+    weights : (K,), not negative, of sum 1: numbers, ``[1 - p, p]``, or a parameter of distribution
         Dirichlet; they may depend on states. (K, ...) gives each element its own.
     components : K distributions of numbers, all continuous or all of whole numbers, of one shape or
         scalars.
@@ -127,7 +127,8 @@ class Mixture(Distribution):
         return array(out)
 
     def in_range(self) -> ExprArray | None:
-        """As of any law, for all components at once: what is never chosen has to exist too."""
+        """As of any distribution, for all components at once: what is never chosen has to exist
+        too."""
         return holding([super().in_range(), sum_holds(self.weights), *map(exists, self.components)])
 
     def _parts(self, value: ExprArray) -> list[ExprArray]:
@@ -261,10 +262,10 @@ class ZeroInflated(Distribution):
 
     Parameters
     ----------
-    law : a distribution of counts: Poisson, NegativeBinomial, Binomial, BetaBinomial. Of a law
-        without zeros, ``Truncated(Poisson(rate), lower=1)``, it makes a hurdle model.
-    p : probability of a structural zero, one that is none of the law's: the `zi` of brms, the
-        `gate` of NumPyro, 1 - `psi` of PyMC.
+    law : a distribution of counts: Poisson, NegativeBinomial, Binomial, BetaBinomial. Of a
+        distribution without zeros, ``Truncated(Poisson(rate), lower=1)``, it makes a hurdle model.
+    p : probability of a structural zero, one that is none of the distribution's: the `zi` of brms,
+        the `gate` of NumPyro, 1 - `psi` of PyMC.
     """
 
     discrete = True
@@ -309,7 +310,7 @@ class ZeroInflated(Distribution):
         return where(ew("eq", v, 0.0), log_sum([p, 1.0 - p], parts), rest + self._of_base(v))
 
     def _of_base(self, value: ExprArray) -> ExprArray:
-        """The law's own log density from 0 on; -inf at zeros that it does not have."""
+        """The distribution's own log density from 0 on; -inf at zeros that it does not have."""
         from_zero = all(e.data == 0.0 for e in self.base.support().lower.ravel())
         return array(self.base.log_densities(value) if from_zero else cut(self.base, value))
 

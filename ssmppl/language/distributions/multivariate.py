@@ -4,7 +4,8 @@ analyses only.
 
 Gelman et al. (2013), "Bayesian data analysis", appendix A, for densities and moments; samplers:
 Cholesky (MvNormal), normalised gammas (Dirichlet), Bartlett's decomposition (Wishart), Smith and
-Hocking (1972), algorithm AS 53. Matrices that are parameters are checked where the law is made.
+Hocking (1972), algorithm AS 53. Matrices that are parameters are checked where the distribution is
+made.
 """
 
 from __future__ import annotations
@@ -95,7 +96,8 @@ def _check_numbers(law: Distribution, name: str, m: ExprArray) -> None:
 
 
 def _check_symmetry(law: Distribution, name: str, m: ExprArray) -> None:
-    """Of symbols: for what reads one half only, and for what reads both, it would be two laws."""
+    """Of symbols: for what reads one half only, and for what reads both, it would be two
+    distributions."""
     pairs = [(i, j) for i in range(len(m)) for j in range(i) if m[i, j] is not m[j, i]]
     if not pairs:
         return
@@ -133,7 +135,7 @@ class MvNormal(_Joint):
     ----------
     mean : shape (d,), or one number for all components.
     covariance, precision, cholesky : exactly one of them, (d, d): the covariance, its inverse, or
-        its lower factor L with L L' = covariance. As the law of states a covariance may be
+        its lower factor L with L L' = covariance. As the distribution of states a covariance may be
         singular, as q G G' is, for all values of its symbols or in some cases of the conditions in
         it: methods that need no density of the transition take it.
     """
@@ -228,7 +230,8 @@ def where_definite(m: ExprArray, density: Expr) -> Expr:
 
 def surely_positive(m: ExprArray) -> bool:
     """Whether a matrix is one of numbers (checked before), a parameter with that support, or the
-    inverse of one: what its own law keeps positive definite. Of a diagonal one the logs see to it.
+    inverse of one: what its own distribution keeps positive definite. Of a diagonal one the logs
+    see to it.
     """
     entries = [as_expr(e) for e in m.ravel()]
     off = [as_expr(m[i, j]) for i, j in np.ndindex(m.shape) if i != j]

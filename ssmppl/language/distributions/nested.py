@@ -1,8 +1,9 @@
-"""What laws of laws need: whether an inner law exists, its density where the outer law has one, and
-shares of 1, which are the probabilities of Categorical and the weights of Mixture.
+"""What distributions of distributions need: whether an inner distribution exists, its density where
+the outer distribution has one, and shares of 1, which are the probabilities of Categorical and the
+weights of Mixture.
 
-Shares that are numbers and do not sum to 1 are refused where the law is made; expressions have to
-where they have values. What is chosen by shares has the density `log_sum`.
+Shares that are numbers and do not sum to 1 are refused where the distribution is made; expressions
+have to where they have values. What is chosen by shares has the density `log_sum`.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ def holding(conditions: Iterable[ExprArray | None]) -> ExprArray | None:
 
 
 def exists(law: Distribution) -> ExprArray | None:
-    """Whether a law's parameters are in range and its support is not empty; None where nothing
-    has to be asked. Alone such a law has no density, beside another it would pass unseen."""
+    """Whether a distribution's parameters are in range and its support is not empty; None where
+    nothing has to be asked. Alone such a distribution has no density, beside another it would pass
+    unseen."""
     support = law.support()
     pairs = [array(b) for b in (support.lower, support.upper)]
     ordered = None
@@ -48,8 +50,8 @@ def exists(law: Distribution) -> ExprArray | None:
 
 
 def cut(law: Distribution, value: ExprArray) -> ExprArray:
-    """A law's log density, -inf outside of its support: computed there at a value inside, so that
-    neither it nor a derivative of it is NaN."""
+    """A distribution's log density, -inf outside of its support: computed there at a value inside,
+    so that neither it nor a derivative of it is NaN."""
     support = law.support()
     lower, upper = array(support.lower), array(support.upper)
     low_end, high_end = is_infinite(lower), is_infinite(upper)
@@ -79,7 +81,7 @@ def _sums(shares: Iterable[Any]) -> ExprArray:
 
 
 def check_sum(shares: Iterable[Any], kind: str, sums: str, fix: str, where: Location) -> None:
-    """Refuse numbers that do not sum to 1: the shares of a law of this kind.
+    """Refuse numbers that do not sum to 1: the shares of a distribution of this kind.
 
     sums : the subject and its verb, as in "weights sum".
     """

@@ -115,7 +115,7 @@ class Weibull(_Positive):
 
     Parameters
     ----------
-    shape : positive; 1 is the exponential law.
+    shape : positive; 1 is the exponential distribution.
     scale : positive; 63% lie below it.
     """
 
@@ -304,7 +304,8 @@ def _lower_end(e: Expr) -> float:
 
 
 def log_gamma(a: ExprArray) -> ExprArray:
-    """log of the gamma function, NaN below 0: it is finite there, where no law has a density."""
+    """log of the gamma function, NaN below 0: it is finite there, where no distribution has a
+    density."""
     if not all(map(never_negative, a.ravel())):
         a = where(ew("le", 0.0, a), a, math.nan)
     return array(ew("gammaln", a))

@@ -103,7 +103,7 @@ class Truncated(Distribution):
         return {n: _as_given(self.parameters[n], self.discrete) for n in ("lower", "upper")}
 
     def with_base(self, base: Distribution) -> Distribution:
-        """Another law between the same bounds."""
+        """Another distribution between the same bounds."""
         return self._at_place(_between(base, self.given_bounds()))
 
     def _refuse_empty(self) -> None:
@@ -145,8 +145,8 @@ class Truncated(Distribution):
         return self.base.log_densities(array(value)) - self.base.log_mass(*self._bounds())
 
     def guarded_log_densities(self, value):
-        """As of any law; NaN where so little of the base lies between the bounds that there is no
-        number for it, whose logarithm would make the density infinite."""
+        """As of any distribution; NaN where so little of the base lies between the bounds that
+        there is no number for it, whose logarithm would make the density infinite."""
         density, mass = super().guarded_log_densities(value), self.base.log_mass(*self._bounds())
         if not any(symbols_of(e) for e in array(mass).ravel()):
             return density  # looked at when the law was made
@@ -209,7 +209,7 @@ class Truncated(Distribution):
         return array(out)
 
     def _width(self, most: int = MOST_COUNTED) -> int | None:
-        """upper - lower for a discrete law between a few numbers, else None."""
+        """upper - lower for a discrete distribution between a few numbers, else None."""
         bounds = [a.ravel() for a in self._bounds()]
         if not self.discrete or any(e.op != "const" for a in bounds for e in a):
             return None
@@ -263,14 +263,14 @@ class Truncated(Distribution):
     def _inflated_moments(
         self, base: ZeroInflated, lower: ExprArray, upper: ExprArray
     ) -> tuple[ExprArray, ExprArray]:
-        """From those of the law that zeros were added to, cut likewise."""
+        """From those of the distribution that zeros were added to, cut likewise."""
         inner = Truncated(base.base, lower=lower, upper=upper)
         mass = base.base.log_mass(*inner._bounds()) - base.log_mass(lower, upper)
         share, mean = (1.0 - base.p) * ew("exp", mass), inner.mean()
         return share * mean, share * (inner.variance() + (1.0 - share) * mean**2)
 
     def _summed_moments(self) -> tuple[ExprArray, ExprArray]:
-        """Sums over the values of a discrete law between a few numbers; else NaN."""
+        """Sums over the values of a discrete distribution between a few numbers; else NaN."""
         width = self._width(MOST_SUMMED)
         if width is None:
             return self._full(math.nan), self._full(math.nan)
@@ -334,13 +334,13 @@ def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[fl
 
 
 def _between(base: Distribution, bounds: dict[str, ExprArray]) -> Truncated:
-    """With these bounds but for infinite ones; one law of several may have no others, which it is
-    given as they are."""
+    """With these bounds but for infinite ones; one distribution of several may have no others,
+    which it is given as they are."""
     return Truncated(base, **({n: b for n, b in bounds.items() if not is_infinite(b)} or bounds))
 
 
 def _as_given(bound: Any, discrete: bool) -> ExprArray:
-    """Without the whole number that was taken of it where the law is discrete."""
+    """Without the whole number that was taken of it where the distribution is discrete."""
     given = [
         e.args[0] if discrete and e.op in ("ceil", "floor") else e for e in array(bound).ravel()
     ]

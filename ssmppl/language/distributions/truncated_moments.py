@@ -1,4 +1,4 @@
-"""Moments of laws between bounds, for those that have them in closed form.
+"""Moments of distributions between bounds, for those that have them in closed form.
 
 Differences in such forms cancel in intervals that are narrow, or far out in a tail. Those are left
 to series and to Gauss-Legendre quadrature of the density, scaled to the interval: the relative
@@ -25,9 +25,9 @@ FLAT = 40.0  # standard deviations, or widths of an exponential, beyond which no
 
 
 def normal_moments(base: Any, lower: ExprArray, upper: ExprArray) -> tuple[ExprArray, ExprArray]:
-    """Of a Normal law: by quadrature where the mode is outside or the interval narrow; else in
-    closed form: Johnson, Kotz and Balakrishnan (1994), "Continuous univariate distributions",
-    section 13.10.1, whose differences cancel there."""
+    """Of a Normal distribution: by quadrature where the mode is outside or the interval narrow;
+    else in closed form: Johnson, Kotz and Balakrishnan (1994), "Continuous univariate
+    distributions", section 13.10.1, whose differences cancel there."""
     sd, centre = base.sd(), base.mean()
     a, b = ((bound - centre) / sd for bound in (lower, upper))
     width = where(ew("lt", lower, upper), (upper - lower) / sd, math.nan)
@@ -65,7 +65,8 @@ def normal_moments(base: Any, lower: ExprArray, upper: ExprArray) -> tuple[ExprA
 def exponential_moments(
     base: Any, lower: ExprArray, upper: ExprArray
 ) -> tuple[ExprArray, ExprArray]:
-    """Of an Exponential law, without memory: those of one cut off at upper - lower, moved by lower.
+    """Of an Exponential distribution, without memory: those of one cut off at upper - lower, moved
+    by lower.
 
     With h half of that, in units of the scale, they are 1 + h - h coth h and 1 - (h / sinh h)^2;
     where h is small, their series.
@@ -87,7 +88,7 @@ def exponential_moments(
 def weighted_moments(
     base: Distribution, lower: ExprArray, upper: ExprArray
 ) -> tuple[ExprArray, ExprArray]:
-    """From the laws with density x f(x) and x^2 f(x): `Distribution.weighted`."""
+    """From the distributions with density x f(x) and x^2 f(x): `Distribution.weighted`."""
     if base.discrete:
         mean, second = _weighted(base, lower, upper)
         variance = array(ew("maximum", second - mean * (mean - 1.0), 0.0))
@@ -117,8 +118,8 @@ def _weighted(
 def moments_from_zero(
     base: Distribution, lower: ExprArray, upper: ExprArray
 ) -> tuple[ExprArray, ExprArray]:
-    """Of a law from 0 on: E[X^2] - E[X]^2, or by quadrature where that cancels, in an interval that
-    is narrow beside its distance from 0 and has a density of like size throughout."""
+    """Of a distribution from 0 on: E[X^2] - E[X]^2, or by quadrature where that cancels, in an
+    interval that is narrow beside its distance from 0 and has a density of like size throughout."""
     mean, second = _weighted(base, lower, upper)
     variance = second - mean**2
     known = [e.op == "const" and e.data <= 0.0 for e in lower.ravel()]

@@ -1,4 +1,5 @@
-"""Calling a user's law on symbols: what it reads, where it returns, and errors at its own lines."""
+"""Calling a user's distribution on symbols: what it reads, where it returns, and errors at its own
+lines."""
 
 from __future__ import annotations
 
@@ -77,10 +78,10 @@ _ASKED_OF_SYMBOLS = tuple(
 
 
 def call(function: Law, role: str, arguments: dict[str, Any], known: Roles) -> Any:
-    """What the law returns for these arguments.
+    """What the distribution returns for these arguments.
 
-    It is called twice: a law that is not the same again draws random numbers or changes something,
-    and what was drawn would be frozen into the model.
+    It is called twice: a distribution that is not the same again draws random numbers or changes
+    something, and what was drawn would be frozen into the model.
     """
     check_lookups(function, role, arguments)
     first = call_once(function, role, arguments, known)
@@ -128,7 +129,7 @@ def _content(d: Distribution) -> list[tuple[str, str]]:
 
 
 def return_location(function: Law) -> Location:
-    """The line of the law's only `return`; its `def` where there are several."""
+    """The line of the distribution's only `return`; its `def` where there are several."""
     plain = plain_function(function)
     lines, line = set(), 0
     for instruction in dis.get_instructions(plain.__code__):
@@ -142,11 +143,11 @@ def return_location(function: Law) -> Location:
 
 # -- names from outside of the law
 def check_outer_names(function: Law, role: str, known: Roles) -> None:
-    """Refuse a law that reads a variable of Python's named as a quantity of the model, itself or
-    in a function of the user's that it calls.
+    """Refuse a distribution that reads a variable of Python's named as a quantity of the model,
+    itself or in a function of the user's that it calls.
 
-    With `phi = 0.9` at the top of the file, a law that forgets `phi` among its arguments would
-    quietly use 0.9.
+    With `phi = 0.9` at the top of the file, a distribution that forgets `phi` among its arguments
+    would quietly use 0.9.
     """
     who = f"@{role} {function.__name__} reads"
     to_read: list[tuple[Callable[..., Any], str]] = [(function, who)]
@@ -205,8 +206,8 @@ def _at_users_line(error: SSMError, function: Law) -> SSMError:
 
 
 def _library_function(function: Law, trace: TracebackType | None) -> str:
-    """The name of the function of an installed library that the law called and that failed; ""
-    where it was none."""
+    """The name of the function of an installed library that the distribution called and that
+    failed; "" where it was none."""
     file, called = plain_function(function).__code__.co_filename, ""
     for frame, after in itertools.pairwise(traceback.extract_tb(trace)):
         if frame.filename == file:

@@ -1,12 +1,12 @@
 """What functions are known by: their code, and all that they read from outside.
 
 `digest_of_code` is taken at every call of a verb, and holds within this process: a trace keeps the
-numbers that its laws read, and is made anew where the digest differs. Of a module or an object
-those attributes count that the code names, anywhere in the functions that are reached, and what the
-special methods of its class read; all of them where the code has one of the words that read all
-(`WHOLE`). Of a function counts what it reads in its turn; of an object of a library, such as a
-Series of pandas, its pickle. What has no other form goes by which object it is, and libraries by
-their names.
+numbers that its distributions read, and is made anew where the digest differs. Of a module or an
+object those attributes count that the code names, anywhere in the functions that are reached, and
+what the special methods of its class read; all of them where the code has one of the words that
+read all (`WHOLE`). Of a function counts what it reads in its turn; of an object of a library, such
+as a Series of pandas, its pickle. What has no other form goes by which object it is, and libraries
+by their names.
 
 `fingerprint` spells out more, and is the same in every process and wherever the function stands:
 there is no address and no line in it. What other installed packages give goes by its name, as their
@@ -65,7 +65,7 @@ INSTALLED = tuple(
 
 
 class Declared:
-    """What laws may read under a name and that can change without being another object.
+    """What distributions may read under a name and that can change without being another object.
 
     functions : what it was declared by.
     """

@@ -1,11 +1,12 @@
 """What the covariance of a traced MvNormal is made of: independent components, or too few noises.
 
-One with zeros off its diagonal is a Normal law of each component, and is taken as such. One whose
-rank is less than its size (q G G', one noise that drives several states) has no density; draws need
-a root of it, found by the Cholesky recursion in the given order, whose pivots of zero leave columns
-of zeros (Higham 2002, "Accuracy and stability of numerical algorithms", section 10.3).
-A pivot that is zero in some cases only leaves zeros there. What was found is held against the
-matrix over a wide range, as one that is singular at moderate values may have another noise beyond.
+One with zeros off its diagonal is a Normal distribution of each component, and is taken as such.
+One whose rank is less than its size (q G G', one noise that drives several states) has no density;
+draws need a root of it, found by the Cholesky recursion in the given order, whose pivots of zero
+leave columns of zeros (Higham 2002, "Accuracy and stability of numerical algorithms", section
+10.3). A pivot that is zero in some cases only leaves zeros there. What was found is held against
+the matrix over a wide range, as one that is singular at moderate values may have another noise
+beyond.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ LARGEST = 12  # components; the root of more is not written out in symbols
 
 
 def independent(law: Distribution) -> Distribution:
-    """A Normal law of each component in place of an MvNormal one with zeros off its diagonal."""
+    """A Normal distribution of each component in place of an MvNormal one with zeros off its
+    diagonal."""
     if not isinstance(law, MvNormal):
         return law
     matrix = law.parameters[law.spread].view(np.ndarray)
@@ -43,7 +45,7 @@ def independent(law: Distribution) -> Distribution:
 
 
 def find_root(law: Distribution) -> None:
-    """Give an MvNormal law of singular covariance its root."""
+    """Give an MvNormal distribution of singular covariance its root."""
     if not isinstance(law, MvNormal) or law.spread != "covariance":
         return
     matrix = law.parameters["covariance"]

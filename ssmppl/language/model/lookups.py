@@ -1,8 +1,9 @@
-"""Symbols that a law looks up in a set or a dictionary, which does not have them and says nothing.
+"""Symbols that a distribution looks up in a set or a dictionary, which does not have them and says
+nothing.
 
 `u in {1, 2}` and `TABLE.get(u, 0.0)` ask for the symbol itself, by its hash: there is no operation
-of it that could tell. They are found in the law's own instructions, where an argument goes there
-by its name: not in functions that the law calls, nor under another name.
+of it that could tell. They are found in the distribution's own instructions, where an argument goes
+there by its name: not in functions that the distribution calls, nor under another name.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ def check_lookups(function: Callable[..., Any], role: str, arguments: Mapping[st
 
 
 def _rebound(code: CodeType, found: list[dis.Instruction]) -> set[str]:
-    """Names that may stand for other things than the law's arguments: assigned anew, or local to a
-    function inside."""
+    """Names that may stand for other things than the distribution's arguments: assigned anew, or
+    local to a function inside."""
     names = {n for i in found if i.opname.startswith("STORE_") for n in _names(i)}
     inner = [c for c in code.co_consts if isinstance(c, CodeType)]
     for c in inner:

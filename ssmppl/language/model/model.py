@@ -141,7 +141,8 @@ class Model:
 
         Parameters
         ----------
-        function : returns their laws by name; its arguments are parameters declared earlier.
+        function : returns their distributions by name; its arguments are parameters declared
+            earlier.
 
         Returns
         -------
@@ -150,12 +151,12 @@ class Model:
         return self._declare("prior", function)
 
     def initial(self, function: Law = _MISSING) -> Law:
-        """Declare the law of x_1, the state at the first row of the data.
+        """Declare the distribution of x_1, the state at the first row of the data.
 
         Parameters
         ----------
-        function : returns the laws of all states by name; its arguments are parameters, inputs
-            and ``t``.
+        function : returns the distributions of all states by name; its arguments are parameters,
+            inputs and ``t``.
 
         Returns
         -------
@@ -164,14 +165,16 @@ class Model:
         return self._declare("initial", function)
 
     def transition(self, function: Law = _MISSING) -> Law:
-        """Declare the law of x_{t+1} given x_t (and u_t, t, y_t where the arguments name them).
+        """Declare the distribution of x_{t+1} given x_t (and u_t, t, y_t where the arguments name
+        them).
 
         Parameters
         ----------
-        function : returns the laws of states by name; its arguments are parameters, states,
-            inputs, observation channels and ``t``, and ``NAME_next``, the new value that a
+        function : returns the distributions of states by name; its arguments are parameters,
+            states, inputs, observation channels and ``t``, and ``NAME_next``, the new value that a
             transition function declared earlier has given to the state NAME. What has no initial
-            law is a draw of the step, which later transition functions read so, and nothing else.
+            distribution is a draw of the step, which later transition functions read so, and
+            nothing else.
 
         Returns
         -------
@@ -180,12 +183,12 @@ class Model:
         return self._declare("transition", function)
 
     def observation(self, function: Law = _MISSING) -> Law:
-        """Declare the law of y_t given x_t (and u_t, t).
+        """Declare the distribution of y_t given x_t (and u_t, t).
 
         Parameters
         ----------
-        function : returns the laws of channels by name; its arguments are parameters, states,
-            inputs and ``t``.
+        function : returns the distributions of channels by name; its arguments are parameters,
+            states, inputs and ``t``.
 
         Returns
         -------
@@ -198,8 +201,8 @@ class Model:
 
         Parameters
         ----------
-        function : returns the laws of all states by name; its arguments are those of a transition,
-            but observation channels mean y_{t+1} here.
+        function : returns the distributions of all states by name; its arguments are those of a
+            transition, but observation channels mean y_{t+1} here.
 
         Returns
         -------
@@ -261,7 +264,8 @@ class Model:
         return f"<Model {self.name!r}{inputs}: {declared or 'nothing declared'}>"
 
     def _repr_html_(self) -> str:
-        """What was declared, where, on what each law depends, and the functions as they stand."""
+        """What was declared, where, on what each distribution depends, and the functions as they
+        stand."""
         rows, texts = [], []
         for role in ROLES:
             for function in self.functions[role]:

@@ -1,8 +1,8 @@
 """What is sent to other processes: pickled once here, unpickled once there.
 
-A model's laws do not travel: what is sent is the trace, the expressions that they gave. Of the
-user's functions only those travel that are called for every particle, `@ssm.primitive`, and those
-that `diagnose` tries, `@ssm.effect`.
+A model's distributions do not travel: what is sent is the trace, the expressions that they gave. Of
+the user's functions only those travel that are called for every particle, `@ssm.primitive`, and
+those that `diagnose` tries, `@ssm.effect`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a traced model is: its quantities, each a site with its law in terms of symbols.
+"""What a traced model is: its quantities, each a site with its distribution in terms of symbols.
 
 A `Trace` holds, for every parameter, state and observation, its distribution(s) in terms of
 symbols, and where each expression was written. Kinds of symbols:
@@ -12,10 +12,10 @@ observation_prev  y_{t-1}, where a transition names a channel
 input, input_prev u_t and u_{t-1};  time, time_prev: the row number, from 1
 ================  ============================================================
 
-The law of a transition may read new values too, `NAME_next` in the user's function: those of the
-noisy components that stand before it in `Trace.transition`, by their symbols of kind "state"; of a
-deterministic state it holds the value's own expression. So p(x_t | x_{t-1}) is the product of the
-laws in that order.
+The distribution of a transition may read new values too, `NAME_next` in the user's function: those
+of the noisy components that stand before it in `Trace.transition`, by their symbols of kind
+"state"; of a deterministic state it holds the value's own expression. So p(x_t | x_{t-1}) is the
+product of the distributions in that order.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ssmppl.language.model.pickling import UnpackedCache, digest_of, packed, unp
 
 @dataclass(frozen=True)
 class Site:
-    """One named quantity under one law.
+    """One named quantity under one distribution.
 
     value : the symbols of the quantity, of the distribution's shape (symmetric matrices share
         the symbols of their lower half).
@@ -63,10 +63,10 @@ class Site:
 class Trace:
     """The traced model; see the module's docstring for its symbols.
 
-    transition : in an order in which each law reads new values of earlier ones only.
+    transition : in an order in which each distribution reads new values of earlier ones only.
     choices : element of an array that a symbol chose -> (the index, the number of elements).
-    auxiliary : names of the states that are draws of a step: read by later laws of the same step
-        only. At the first row, where no step has led to, they are 0.
+    auxiliary : names of the states that are draws of a step: read by later distributions of the
+        same step only. At the first row, where no step has led to, they are 0.
     time_step : the input that is the time to the next row, and its unit where times are dates.
     """
 
@@ -107,7 +107,8 @@ class Trace:
 
     @property
     def approximations(self) -> dict[str, str]:
-        """What a law stands for where it is an approximation, by the name of its quantity."""
+        """What a distribution stands for where it is an approximation, by the name of its
+        quantity."""
         return {
             s.name: text for s in self.transition.values() if (text := s.distribution.approximation)
         }

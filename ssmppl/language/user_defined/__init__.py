@@ -1,1 +1,1 @@
-"""What users add to the language: laws by their log densities, and compiled functions."""
+"""What users add to the language: distributions by their log densities, and compiled functions."""

@@ -1,6 +1,6 @@
-"""`@ssm.distribution`: a decorator that makes a law of a log density, and of what else is declared:
-sampler, moments, distribution function. The functions are run on placeholders where the law stands
-in a model.
+"""`@ssm.distribution`: a decorator that makes a distribution of a log density, and of what else is
+declared: sampler, moments, distribution function. The functions are run on placeholders where the
+distribution stands in a model.
 """
 
 from __future__ import annotations
@@ -55,20 +55,21 @@ def distribution(
 
     Parameters
     ----------
-    function : log density, of discrete laws log probability, at its first argument, in plain NumPy
-        for one number; its further arguments are those of the law. Outside of the support it is
-        not asked. It should be normalised: what is left out of it is missing in every likelihood.
-    lower, upper : bounds of the support, numbers or names of the law's arguments; None: there is
-        none.
+    function : log density, of discrete distributions log probability, at its first argument, in
+        plain NumPy for one number; its further arguments are those of the distribution. Outside of
+        the support it is not asked. It should be normalised: what is left out of it is missing in
+        every likelihood.
+    lower, upper : bounds of the support, numbers or names of the distribution's arguments; None:
+        there is none.
     discrete : whether the values are whole numbers; the bounds are among them.
-    closed : whether the bounds of a continuous law belong to its support.
+    closed : whether the bounds of a continuous distribution belong to its support.
     positive : names of arguments that have to be positive: numbers that are not are refused, and
-        where expressions leave that range the density is nan, as that of other laws.
+        where expressions leave that range the density is nan, as that of other distributions.
 
     Returns
     -------
-    DeclaredDistribution : called with its arguments a law like any other; with the decorators
-        `sampler`, `mean`, `variance`, `cdf` and `quantile`, and `check`.
+    DeclaredDistribution : called with its arguments a distribution like any other; with the
+        decorators `sampler`, `mean`, `variance`, `cdf` and `quantile`, and `check`.
 
     Raises
     ------
@@ -133,7 +134,7 @@ def _bound(keyword: str, value: Any, function: Function, discrete: bool) -> floa
 
 
 class DeclaredDistribution(Declared):
-    """A law of a user's own: called with its arguments it is a distribution.
+    """A user's own distribution, made by calling it with its arguments.
 
     Attributes
     ----------
@@ -177,7 +178,8 @@ class DeclaredDistribution(Declared):
         ----------
         function : returns one draw; its first argument is the source of random numbers, with the
             methods uniform, normal, exponential, gamma, poisson, binomial, random and
-            standard_normal of NumPy's `Generator`; the others are arguments of the law, by name.
+            standard_normal of NumPy's `Generator`; the others are arguments of the distribution, by
+            name.
 
         Returns
         -------
@@ -186,11 +188,11 @@ class DeclaredDistribution(Declared):
         return self._declare("draw", function)
 
     def mean(self, function: Function = _MISSING) -> Function:
-        """Declare its expectation, for predictions: a function of arguments of the law.
+        """Declare its expectation, for predictions: a function of arguments of the distribution.
 
         Parameters
         ----------
-        function : returns it; its arguments are arguments of the law, by name.
+        function : returns it; its arguments are arguments of the distribution, by name.
 
         Returns
         -------
@@ -203,7 +205,7 @@ class DeclaredDistribution(Declared):
 
         Parameters
         ----------
-        function : returns it; its arguments are arguments of the law, by name.
+        function : returns it; its arguments are arguments of the distribution, by name.
 
         Returns
         -------
@@ -217,7 +219,7 @@ class DeclaredDistribution(Declared):
         Parameters
         ----------
         function : returns P(Y <= y) for y in the support; its first argument is y, the others are
-            arguments of the law, by name.
+            arguments of the distribution, by name.
 
         Returns
         -------
@@ -226,16 +228,18 @@ class DeclaredDistribution(Declared):
         return self._declare("cdf", function)
 
     def quantile(self, function: Function = _MISSING) -> Function:
-        """Declare the inverse of `cdf`: with both the law can be truncated, and without a sampler
-        draws are quantiles of uniform ones.
+        """Declare the inverse of `cdf`: with both the distribution can be truncated, and without a
+        sampler draws are quantiles of uniform ones.
 
-        The upper tail of a truncated law is one less `cdf`, so that bounds beyond which there is
-        less than 1e-10 of the law lose digits, and its moments have none of what lies beyond 1e-16.
+        The upper tail of a truncated distribution is one less `cdf`, so that bounds beyond which
+        there is less than 1e-10 of the distribution lose digits, and its moments have none of what
+        lies beyond 1e-16.
 
         Parameters
         ----------
-        function : returns the y with P(Y <= y) = p, of discrete laws the smallest with at least
-            that; its first argument is p, the others are arguments of the law, by name.
+        function : returns the y with P(Y <= y) = p, of discrete distributions the smallest with at
+            least that; its first argument is p, the others are arguments of the distribution, by
+            name.
 
         Returns
         -------
@@ -327,20 +331,21 @@ class DeclaredDistribution(Declared):
     def check(
         self, *args: Any, draws: int = 10_000, level: float = 1e-4, seed: int = 0, **kwargs: Any
     ) -> Agreement:
-        """Hold what was declared of the law against its density, at some arguments.
+        """Hold what was declared of the distribution against its density, at some arguments.
 
         The density is integrated over the support, by adaptive Gauss-Legendre quadrature, or
         summed; mean, variance and distribution function that were declared are compared with the
         same integrals; and draws are tested against the integrated density by the exact
-        Kolmogorov-Smirnov test, which for discrete laws errs on the safe side.
+        Kolmogorov-Smirnov test, which for discrete distributions errs on the safe side.
 
         Parameters
         ----------
-        *args : the law's arguments, numbers; those named as one of the following have to be here.
+        *args : the distribution's arguments, numbers; those named as one of the following have to
+            be here.
         draws : number of draws.
         level : of the test; a right sampler fails with at most this probability.
         seed : of the draws.
-        **kwargs : the law's arguments by their names.
+        **kwargs : the distribution's arguments by their names.
 
         Returns
         -------
@@ -411,13 +416,13 @@ def form(
 ) -> Expr:
     """What a function gives, in `VALUE` and placeholders for the arguments that are no numbers.
 
-    It is called twice, as the laws of a model are (`calling.call`).
+    It is called twice, as the distributions of a model are (`calling.call`).
 
     Parameters
     ----------
     part : "density", "draw", "mean", "variance", "cdf" or "quantile".
     verb : its decorator, for messages.
-    parameters : names of the law's arguments; pattern: their numbers.
+    parameters : names of the distribution's arguments; pattern: their numbers.
 
     Raises
     ------

@@ -58,7 +58,7 @@ class Opaque:
     name : of it in generated code, the same in every process. compiled : the function, by Numba.
     numbers : the same as Python calls it, without compiling anything further. plain : what is
     called on numbers. root : the user's primitive that it is, or whose derivative it is.
-    spelled : how it is called in a law. key : what it and its derivatives are known by.
+    spelled : how it is called in a distribution. key : what it and its derivatives are known by.
     """
 
     name: str
@@ -291,7 +291,7 @@ def primitive(*, derivative: Derivative | None = None) -> Callable[[Function], P
 def primitive(
     function: Function | None = None, *, derivative: Derivative | None = None
 ) -> Primitive | Callable[[Function], Primitive]:
-    """Make a function of numbers callable inside a model's laws.
+    """Make a function of numbers callable inside a model's distributions.
 
     Its derivatives, which proposals, the Gaussian approximations, scores, `maximize` and `diagnose`
     ask for, are those given, else central differences of the compiled function: two calls for a
@@ -313,14 +313,14 @@ def primitive(
 
     Returns
     -------
-    Primitive : takes numbers as the function does, and symbols inside of a law, where it returns an
-        expression, or a tuple of them.
+    Primitive : takes numbers as the function does, and symbols inside of a distribution, where it
+        returns an expression, or a tuple of them.
 
     Raises
     ------
     ModelError : Numba cannot compile it; names the function, its line and Numba's reason. A given
-        derivative that is not one. Also in a law, where a variable that the function reads has
-        changed since.
+        derivative that is not one. Also in a distribution, where a variable that the function reads
+        has changed since.
 
     Examples
     --------

@@ -1,4 +1,5 @@
-"""Laws of states that follow a stochastic differential equation between the rows: `ssm.SDE`.
+"""Distributions of states that follow a stochastic differential equation between the rows:
+`ssm.SDE`.
 
 Between two rows dx = f(x) dt + G(x) dW is approximated by its linearisation along the mean (A. H.
 Jazwinski, *Stochastic Processes and Filtering Theory*, 1970, section 9.4: the prediction of the
@@ -6,9 +7,9 @@ continuous-discrete extended Kalman filter):
 
     dm / dt = f(m),    dP / dt = J P + P J' + G(m) G(m)',    J = df / dx at m,
 
-from m = x and P = 0. Where f is linear and G constant this is the exact law, and solved as such (C.
-F. Van Loan, "Computing integrals involving the matrix exponential", *IEEE Transactions on Automatic
-Control* 23, 1978).
+from m = x and P = 0. Where f is linear and G constant this is the exact distribution, and solved as
+such (C. F. Van Loan, "Computing integrals involving the matrix exponential", *IEEE Transactions on
+Automatic Control* 23, 1978).
 """
 
 from __future__ import annotations
@@ -42,17 +43,19 @@ METHODS = ("linearised", "euler-maruyama")
 
 
 class SDE:
-    """The law of a state that moves by dx = drift(x) dt + diffusion(x) dW until the next row.
+    """The distribution of a state that moves by dx = drift(x) dt + diffusion(x) dW until the next
+    row.
 
-    In a `@transition` function it stands as the law of the state by whose name it is returned, and
-    starts from that state's value. The law is Gaussian: the exact one where the drift is linear and
-    the diffusion does not depend on the state (then `steps` does not matter), else an approximation
-    that is the better the shorter `dt` is; `explain` says which.
+    In a `@transition` function it stands as the distribution of the state by whose name it is
+    returned, and starts from that state's value. The distribution is Gaussian: the exact one where
+    the drift is linear and the diffusion does not depend on the state (then `steps` does not
+    matter), else an approximation that is the better the shorter `dt` is; `explain` says which.
 
     With `method="euler-maruyama"` the state moves in small steps with a noise each, x + f h + G
-    sqrt(h) e, which is the better the more steps there are, whatever the law's shape. The noises of
-    all but the last step are drawn within the row, as a quantity of their own, `NAME_noise`; the
-    last one's is the law's. For particles; each step adds to the model's text.
+    sqrt(h) e, which is the better the more steps there are, whatever the distribution's shape. The
+    noises of all but the last step are drawn within the row, as a quantity of their own,
+    `NAME_noise`; the last one's is the distribution's. For particles; each step adds to the model's
+    text.
 
     Parameters
     ----------
@@ -109,8 +112,8 @@ class SDE:
         self.steps, self.method = int(steps), method
 
     def laws(self, name: str, before: Any) -> dict[str, Distribution]:
-        """The laws at a row, from the state's value at the row before: of the small steps' noises,
-        where there are any, and of the state.
+        """The distributions at a row, from the state's value at the row before: of the small steps'
+        noises, where there are any, and of the state.
 
         Parameters
         ----------
@@ -120,7 +123,7 @@ class SDE:
         Returns
         -------
         dict
-            Laws by name, that of the state last.
+            Distributions by name, that of the state last.
         """
         if self.method == "linearised":
             return {name: self.law(name, before)}
@@ -154,7 +157,7 @@ class SDE:
         return laws
 
     def law(self, name: str, before: Any) -> Distribution:
-        """The linearised law of the state at a row, from its value at the row before.
+        """The linearised distribution of the state at a row, from its value at the row before.
 
         Parameters
         ----------
@@ -281,8 +284,8 @@ def _symmetric(values: Any, places: list[tuple[int, int]], n: int) -> Matrix:
 def started(
     laws: Any, role: str, function: str, where: Location, before: Callable[[str], Any]
 ) -> Any:
-    """What a function of the user's returned, with the laws that its SDEs are; those of their small
-    steps' noises before them.
+    """What a function of the user's returned, with the distributions that its SDEs are; those of
+    their small steps' noises before them.
 
     before : (name) -> the value of that state at the row before; None where there is no such state.
     """
@@ -307,7 +310,7 @@ def started(
 
 
 def noises(laws: Any, asked: Any) -> list[str]:
-    """The names of the small steps' noises among these laws: what the user's function did not
-    return."""
+    """The names of the small steps' noises among these distributions: what the user's function did
+    not return."""
     same = laws is asked or not isinstance(laws, Mapping)
     return [] if same else [name for name in laws if name not in asked]

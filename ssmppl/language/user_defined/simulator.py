@@ -63,7 +63,8 @@ class Values(Mapping[str, Any]):
 
 
 class Simulator:
-    """A function of Python that moves a batch of states; called in a law it becomes a node.
+    """A function of Python that moves a batch of states; called in a distribution it becomes a
+    node.
 
     Made by `ssm.simulator`.
 
@@ -119,8 +120,8 @@ class Simulator:
         """The states after one step.
 
         vectors : states, inputs and parameters, each a sequence in the declared order, or a
-            mapping by name; or all of them by keyword. Symbols in a law, elsewhere numbers or
-            arrays, which broadcast.
+            mapping by name; or all of them by keyword. Symbols in a distribution, elsewhere numbers
+            or arrays, which broadcast.
         """
         return self._run(self.moves, self.state, vectors, named)
 
@@ -266,14 +267,14 @@ def simulator(
     outputs: Names = (), forces: Names | Mapping[str, str] = (), name: str | None = None,
     scales: Mapping[str, float] | None = None,
 ) -> Callable[[Call], Simulator]:  # fmt: skip
-    """Make a function of Python that moves a batch callable inside a model's laws.
+    """Make a function of Python that moves a batch callable inside a model's distributions.
 
     `@ssm.simulator(state=["q", "v"], inputs=["u"], parameters=["k", "d"])` stands above
     `step(state (B, n), inputs (B, m), parameters (B, p)) -> (B, n)`: float64 arrays with a row for
     each of B points and a column for each name. The same rows in must give the same rows out,
-    whatever else is in the batch; this is checked at the first call. In a law it is called by name,
-    `new = step(q=q, v=v, u=u, k=k, d=d)`, and gives the new states by name, `new.v` or `new["v"]`,
-    as mean of a transition or value of an `ssm.Dirac`.
+    whatever else is in the batch; this is checked at the first call. In a distribution it is called
+    by name, `new = step(q=q, v=v, u=u, k=k, d=d)`, and gives the new states by name, `new.v` or
+    `new["v"]`, as mean of a transition or value of an `ssm.Dirac`.
 
     Parameters
     ----------

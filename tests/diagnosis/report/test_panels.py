@@ -148,7 +148,7 @@ def test_the_missing_term_is_the_curve_and_its_band(ax):
     corners = ax.collections[0].get_paths()[0].vertices[:, 1]
     assert corners.min() == pytest.approx(table["low"].min())
     assert corners.max() == pytest.approx(table["high"].max())
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("u", "missing in v")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("u", "estimated missing term in v")
     with pytest.raises(ArgumentError, match="v over x, v over u"):
         plots.missing_term(report, ax, variable="w")
     with pytest.raises(ArgumentError, match="none"):

@@ -202,9 +202,9 @@ def test_where_names_the_places_that_stand_out_and_no_others():
 def test_how_far_says_what_moved_and_which_way():
     good = " ".join(how_far(effect_found()))
     assert f"a density ratio of {number(math.exp(0.0812))}" in good
-    assert "falls from 0.213 to 0.094" in good
+    assert "decreases from 0.213 to 0.094" in good
     assert "t = 711 to 1000" in good
-    assert "does not fall: it goes from 0.2 to 0.22" in " ".join(how_far(several()))
+    assert "increases from 0.2 to 0.22" in " ".join(how_far(several()))
     assert "fast mode" in how_far(fast())[0]
     report = effect_found()
     worse = dataclasses.replace(report, closed=report.closed.assign(F=-0.12, F_low=-0.4))

@@ -38,7 +38,7 @@ def table(candidate, strength, variance, refits=(), *, sided=False, quadratic=Fa
             strength=np.array([strength]), variance=np.array([variance]), z=np.array([2.0]),
             gain=np.array([2.0]),
         ),
-        significant=np.array([0.2]), experiments=[SimpleNamespace(time=None)],
+        candidate_p=np.array([0.2]), experiments=[SimpleNamespace(time=None)],
     )  # fmt: skip
     classes = SimpleNamespace(class_id=np.array([1]))
     return causes_table(screen, refits, classes, [0], {}).iloc[0]
