@@ -21,7 +21,7 @@ def text(value: object) -> str:
 
 
 def code(value: object) -> str:
-    """In the type of programs."""
+    """The value in the type of programs."""
     return f"<code>{text(value)}</code>"
 
 

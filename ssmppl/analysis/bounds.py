@@ -47,7 +47,7 @@ def _intervals(roots: Sequence[Expr], domain: Mapping[Expr, Interval]) -> dict[E
 
 
 def _of_loop(node: Expr, args: list[Interval]) -> list[Interval]:
-    """Of the numbers of a loop at its end, step by step; of a long one nothing is known."""
+    """Bounds of the numbers of a loop at its end, step by step; unknown for a long one."""
     loop = node.data
     x, held = args[: loop.states], dict(zip(loop.held, args[loop.states : -1], strict=True))
     least, most = args[-1]

@@ -62,7 +62,7 @@ def _combinations(domain: Mapping[Expr, tuple[float, ...]]) -> int:
 
 
 def _values(site: Site) -> list[tuple[float, ...]] | NotApplicable:
-    """Of each component of a distribution that is not deterministic."""
+    """Values of each component of a distribution that is not deterministic."""
     d, where = site.distribution, site.distribution.location
     support = d.support()
     if support.kind != "integers":

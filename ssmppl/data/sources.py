@@ -80,7 +80,7 @@ def sources(data: Any, named: Iterable[str], argument: str = "data") -> list[Sou
 
 
 def _file(data: Any) -> str:
-    """Of a table that came with the name of its file, that name in brackets."""
+    """The name of the file that a table came from, in brackets; "" where it is not known."""
     attrs = getattr(data, "attrs", None)
     name = attrs.get(FILE) if isinstance(attrs, Mapping) else None
     return f" ({name})" if isinstance(name, str) else ""

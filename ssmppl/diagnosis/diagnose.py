@@ -381,7 +381,7 @@ class _Diagnosis:
         self.checkpoint.say(f"{self.mode} mode: {in_words(rest)} expected from here on")
 
     def _scales(self, states: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> Scales:
-        """From filtered states, observations and inputs."""
+        """The scales of filtered states, observations and inputs."""
         y = np.concatenate([np.where(e.seen == 1.0, e.y, np.nan) for e in experiments])
         u = np.concatenate([e.u for e in experiments])
         longest = max(e.steps for e in experiments)

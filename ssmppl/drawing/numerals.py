@@ -108,7 +108,7 @@ def span(first: Any, last: Any, experiment: Any = "") -> str:
 
 
 def label(value: Any) -> str:
-    """Of a row: its time, or its number; "" where there is none."""
+    """The label of a row: its time, or its number; "" where there is none."""
     if value is None or (isinstance(value, float) and math.isnan(value)) or str(value) == "NaT":
         return ""
     date = isinstance(value, np.datetime64)  # of nanoseconds it would be a number

@@ -110,7 +110,7 @@ class Congruence:
 
     @property
     def size(self) -> int:
-        """p."""
+        """The size p of the matrix."""
         return self.inverse.shape[2]
 
 

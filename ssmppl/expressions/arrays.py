@@ -110,7 +110,8 @@ def elementwise(op: str, *operands: Any) -> Expr | ExprArray:
 
 
 def plain(value: Any) -> np.ndarray:
-    """As a plain object array, so that NumPy's structural functions run as they are."""
+    """The elements as a plain object array, so that NumPy's structural functions run as they
+    are."""
     if isinstance(value, Expr):
         out = np.empty((), dtype=object)
         out[()] = value

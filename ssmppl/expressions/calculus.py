@@ -172,7 +172,7 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
 
 
 def _simulated_slopes(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
-    """Of the values of a simulator."""
+    """Slopes of the values of a simulator."""
     total = [constant(0.0)] * node.data.function.outputs
     for j, argument in enumerate(node.args):
         if argument in tangent and not _is_zero(tangent[argument].value):
@@ -341,7 +341,7 @@ def _relative(node: Expr, tangent: dict[Expr, _Slope]) -> Expr | None:
 
 
 def _fixed_factors(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
-    """Of a product those factors that do not move."""
+    """The factors of a product that do not move."""
     if node not in tangent:
         return [node]
     if node.op == "mul":

@@ -325,8 +325,8 @@ def symbols_in(node: Expr) -> frozenset[Expr]:
 
 
 def _united(node: Expr) -> frozenset[Expr]:
-    """Of the arguments' symbols; the largest of them itself where it holds the others, so that
-    few sets are made."""
+    """The union of the arguments' symbols; the largest of them itself where it holds the others, so
+    that few sets are made."""
     if node.op == "symbol":
         return frozenset((node,))
     each = [a._symbols for a in node.args if a._symbols]

@@ -120,7 +120,7 @@ def poisson_quantile(rate: Any, q: Any) -> Any:
 
 
 def binomial_quantile(n: Any, p: Any, q: Any) -> Any:
-    """Likewise."""
+    """The quantile of a binomial distribution."""
 
     def cdf(k: Any) -> Any:
         return np.where(k >= n, 1.0, sp.betainc(np.maximum(n - k, 0.5), k + 1.0, 1.0 - p))

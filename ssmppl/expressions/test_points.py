@@ -52,7 +52,7 @@ def moderate(forms: list[Expr]) -> TestPoints:
 
 
 def wide(forms: list[Expr]) -> TestPoints:
-    """Of many magnitudes; half of the points have positive values only."""
+    """Points of many magnitudes; half of the points have positive values only."""
     rng, compared = np.random.default_rng(21), _compared(forms)
     values = {}
     for s in _symbols(forms):

@@ -45,7 +45,7 @@ class Prior:
         return self.site is not None or self.draws is not None
 
     def density(self, x: np.ndarray) -> np.ndarray:
-        """At x, increasing and evenly spaced."""
+        """The density at x, increasing and evenly spaced."""
         if self.site is None:
             assert self.draws is not None
             return estimated(self.draws, x, self.lower, self.upper)

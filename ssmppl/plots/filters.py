@@ -1,4 +1,5 @@
-"""`plot_filter` and `plot_ancestry`: how a particle filter fared, and who descends from whom."""
+"""`plot_filter`: effective sample size, and increments of the log-likelihood;
+`plot_ancestry`: the genealogy of the particles."""
 
 from __future__ import annotations
 

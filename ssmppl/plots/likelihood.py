@@ -1,4 +1,5 @@
-"""`plot_likelihood`: the log-likelihood over two parameters, and who walked on it."""
+"""`plot_likelihood`: contours of the log-likelihood over two parameters, with draws and
+iterates."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ def plot_likelihood(
     points: int = 25, particles: int = 500, repeats: int = 4, proposal: str = "auto",
     seed: int | None = 0, executor: Executor | None = None, ax: Any = None,
 ) -> Any:  # fmt: skip
-    """The log-likelihood over two parameters, and the draws or the way to the maximum upon it.
+    """The log-likelihood over two parameters, with draws or with the iterates of `maximize`.
 
     Colours are the log-likelihood below its highest value on the grid. Lines are 0.69, 2.3 and 4.6
     below it: a likelihood of normal shape holds 50%, 90% and 99% of its mass within them. Long,
@@ -247,7 +248,7 @@ def _heights(
     problem: Problem, theta: np.ndarray, where: tuple[int, ...], settings: FilterSettings,
     repeats: int, root: np.random.SeedSequence, points: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """At points (n, 2); a function that another process can be sent."""
+    """The log-likelihood at points (n, 2); a function that another process can be sent."""
     found = np.full(len(points), np.nan)
     for k, point in enumerate(points):
         here = theta.copy()

@@ -1,4 +1,5 @@
-"""`plot_prior_posterior` and `plot_maximization`: what became of the parameters."""
+"""`plot_prior_posterior`: prior and posterior densities; `plot_maximization`: iterates of
+`maximize`."""
 
 from __future__ import annotations
 
@@ -139,7 +140,7 @@ def _densities(ax: Any, prior: Prior, draws: np.ndarray) -> None:
 
 @styled
 def plot_maximization(estimate: Any, *, var_names: Any = None, ax: Any = None) -> Any:
-    """The way of a maximisation: each parameter over the iterations, and where it came to.
+    """Each parameter over the iterations of `maximize`, and the estimate.
 
     The dashed line is the estimate, the band one standard error on both sides; there is no band
     where the information at the estimate was not positive definite. Below, where the method knows

@@ -1,4 +1,4 @@
-"""`plot_predictions`: what the model expected of each row, and whether it was right."""
+"""`plot_predictions`: one-step predictive intervals over the data, and PIT values."""
 
 from __future__ import annotations
 

@@ -238,7 +238,8 @@ def is_prediction(dataset: Any, name: str) -> bool:
 
 
 def quantiles_at_levels(dataset: Any, variable: str, name: str, verb: str) -> dict[str, np.ndarray]:
-    """Of the first draw of a variable, (5, T) at `LEVELS`, of each of its scalars, called by name.
+    """Quantiles of the first draw of a variable, (5, T) at `LEVELS`, of each of its scalars, called
+    by name.
 
     Raises
     ------

@@ -226,7 +226,7 @@ class Wording:
 
     @property
     def names(self) -> list[str]:
-        """Of the components."""
+        """Names of the components."""
         return [to_text(c) for c in self.form.components]
 
     @property

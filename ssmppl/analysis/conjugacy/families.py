@@ -165,13 +165,13 @@ class Normal(Family):
 
     @classmethod
     def match(cls, components: Sequence[Expr], form: BlockForm, positive: bool) -> list[Normal]:
-        """Of all components jointly, where each has a square among the functions."""
+        """A Normal of all components jointly, where each has a square among the functions."""
         found = cls.of(components, form.places)
         return [] if found is None else [found]
 
     @classmethod
     def of(cls, thetas: Sequence[Expr], places: dict[Monomial, int]) -> Normal | None:
-        """By positions of the functions."""
+        """The Normal with these components, by the positions of its functions."""
         linear = tuple(places.get(frozenset({(a, 1.0)}), -1) for a in thetas)
         quadratic = tuple(
             tuple(
@@ -201,7 +201,7 @@ class Normal(Family):
         return len(self.linear)
 
     def parameters(self, c: Statistics) -> tuple[np.ndarray, np.ndarray]:
-        """(h, H)."""
+        """The parameters (h, H)."""
         values = np.asarray(c)
         precision = -values[np.array(self.quadratic)]
         precision[np.diag_indices(len(self.linear))] *= 2.0

@@ -57,7 +57,7 @@ class Family(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """As explanations have it."""
+        """The family's name in explanations."""
 
     @property
     @abstractmethod

@@ -284,7 +284,7 @@ def expectation(expressions: Sequence[Expr], trace: Trace) -> list[Expr] | NotAp
 
 
 def _covariance(k: int, m: int, n: int) -> Expr:
-    """Of the variables k >= m among (x_t, x_{t-1})."""
+    """Covariance of the variables k >= m among (x_t, x_{t-1})."""
     if k < n:
         return moment("covariance", k, m)
     if m >= n:

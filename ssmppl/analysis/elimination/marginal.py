@@ -251,7 +251,7 @@ class _Build:
 
 
 def _previous(expressions: Iterable[Expr]) -> list[Expr]:
-    """The same one step earlier."""
+    """The same quantities one step earlier."""
     expressions = list(expressions)
     earlier = {s: previous(s) for s in symbols_of(expressions) if s.data[0] != "parameter"}
     return substitute(expressions, earlier)

@@ -50,7 +50,7 @@ class GaussianMoments:
         return GaussianMoments(new_mean, new), mean, variance
 
     def predicted(self, a: np.ndarray, b: np.ndarray, q: np.ndarray) -> GaussianMoments:
-        """Of a z + b + N(0, q)."""
+        """Moments of a z + b + N(0, q)."""
         rows = [[_dot(a[i], self.covariance[:, j]) for j in range(len(self.mean))]
                 for i in range(len(b))]  # fmt: skip
         new = np.empty((len(b), len(b)), dtype=object)
@@ -61,7 +61,7 @@ class GaussianMoments:
         return GaussianMoments(mean, new)
 
     def given_exactly(self, values: Sequence[Expr]) -> GaussianMoments:
-        """Of the later components, given the first ones."""
+        """Moments of the later components, given the first ones."""
         k, found = len(values), self
         for value in values:
             row = np.array([constant(1.0)] + [ZERO] * (len(found.mean) - 1), dtype=object)

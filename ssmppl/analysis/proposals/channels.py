@@ -35,8 +35,8 @@ class Channel:
 
 
 def channels(site: Site) -> list[Channel | None]:
-    """Of every component; None where its distribution has no distribution function, or no inverse
-    of it."""
+    """The channels of every component; None where its distribution has no distribution function, or
+    no inverse of it."""
     law, y = of_components(site.distribution), site.value
     parts = _parts(law)
     if law.multivariate or not all(part.inverts() for part in parts):

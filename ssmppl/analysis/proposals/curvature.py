@@ -54,7 +54,7 @@ def bend_of(form: NoiseForm, before: list[Expr]) -> Bend | NotApplicable:
 
 
 def bends(found: LookaheadModel, trace: Trace) -> tuple[Bend, Bend] | NotApplicable:
-    """Of the initial distribution and of the transition."""
+    """Bends of the initial distribution and of the transition."""
     first, later = bend_of(found.initial, []), bend_of(found.transition, trace.state_prev_symbols)
     for one in (first, later):
         if isinstance(one, NotApplicable):

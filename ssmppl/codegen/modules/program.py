@@ -197,7 +197,7 @@ def compile_trace(trace: Trace, missing: Missing = Missing()) -> Program:
 
     Raises
     ------
-    ModelError : a state has a flat initial law, and the model is not linear and Gaussian.
+    ModelError : a state has a flat initial distribution, and the model is not linear and Gaussian.
     """
     key = id(trace), missing
     program = _programs.get(key)  # without the lock: others may compile for long

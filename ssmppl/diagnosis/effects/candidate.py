@@ -223,7 +223,7 @@ def dates(rows: int, profile: str) -> np.ndarray:
 
 
 def periods(rows: int) -> np.ndarray:
-    """In rows: frequencies a half of the record's resolution apart, from one turn on."""
+    """Periods in rows: frequencies a half of the record's resolution apart, from one turn on."""
     turns = np.arange(1.0, rows / SHORTEST, 0.5)[:WAVES]
     return rows / turns if len(turns) else np.array([float(rows)])
 

@@ -142,9 +142,9 @@ def extra_loss(x, strength, p, ambient):
 
 
 # -- loads, gravity, hysteresis, disturbances
-@effect(on="state", name="constant load")
+@effect(on="state", name="constant load", note="l")
 def constant_load(v, strength):
-    """l"""
+    """A constant load: the increment l."""
     return strength
 
 

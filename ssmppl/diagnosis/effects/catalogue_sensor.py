@@ -24,9 +24,9 @@ from ssmppl.language.distributions import Dirac, Normal
 
 
 # -- sensors
-@effect(on="channel", kind="observation", name="sensor bias")
+@effect(on="channel", kind="observation", name="sensor bias", note="l")
 def sensor_bias(h, strength):
-    """l"""
+    """A constant bias: the increment l."""
     return strength
 
 

@@ -56,7 +56,8 @@ class Scales:
 
     @classmethod
     def of(cls, trace: Trace, states: Any, observations: Any, inputs: Any, rows: int) -> Scales:
-        """From arrays whose last axis runs over the trace's symbols of each; others are pooled.
+        """Scales from arrays whose last axis runs over the trace's symbols of each; others are
+        pooled.
 
         states : (..., D), smoothed or drawn. observations : (..., K). inputs : (..., L).
         """
@@ -86,8 +87,8 @@ def value_of(grid: Grid, v: float, scale: VariableScale | None, n: int) -> float
 
 
 def _rounded(value: float, spread: float) -> float:
-    """To `DIGITS` digits of itself or, if that is finer, of the spread: far from zero, as of
-    pressures about 101325, its own would not tell quantiles apart."""
+    """A number rounded to `DIGITS` digits of itself or, if that is finer, of the spread: far from
+    zero, as of pressures about 101325, its own would not tell quantiles apart."""
     sizes = [v for v in (abs(value), spread) if 0.0 < v < math.inf]
     if not sizes:
         return value

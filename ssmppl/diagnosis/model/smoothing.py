@@ -119,7 +119,7 @@ class Smoother:
 
     @once_property
     def extended(self) -> Extended | NotApplicable:
-        """Of a model that calls a simulator, for which many particles take long."""
+        """The smoother of a model that calls a simulator, for which many particles take long."""
         return extended_model(self.columns.base)
 
     @once_property

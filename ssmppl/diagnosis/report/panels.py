@@ -340,7 +340,7 @@ def pictures(report: Findings, width: float = DESK) -> dict[str, bytes]:
 
 
 def _height(report: Findings, name: str, width: float) -> float:
-    """In inches; 0 where there is nothing to draw."""
+    """Height in inches; 0 where there is nothing to draw."""
     if name == "residual_map":
         return 0.7 + 0.3 * max(len(mapped(report)), 3) if len(report.residual_map) else 0.0
     if name == "ranked_effects":

@@ -42,7 +42,7 @@ class NullScale:
 
     @classmethod
     def of(cls, null: np.ndarray) -> NullScale:
-        """From simulated heights (B, G)."""
+        """The scale from simulated heights (B, G)."""
         middle = np.quantile(null, MEDIAN, axis=0)
         number = np.log(MEDIAN) / np.minimum(log_ndtr(middle), -1e-300)
         upper = np.quantile(_as_one(null, number), UPPER, axis=0)

@@ -231,7 +231,7 @@ class Screen:
     def columns_of(self, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray]:
         """(B, K), (K,) scores of these candidates, simulated and observed; of those among them
         whose statistic is a sum of scores. A shape that the screen has not (a period that was
-        refine_wave) stands for the best one of its group."""
+        refined) stands for the best one of its group."""
         known = {c.key: k for k, c in enumerate(self.design.candidates)}
         best = {self.design.candidates[k].group: int(k) for k in self.family.best}
         found = (known.get(c.key, best.get(c.group)) for c in chosen if c.first_order)

@@ -37,7 +37,7 @@ def loop_slopes(node: Expr, wanted: Expr, differentiate: Differentiate) -> list[
 
 
 def _slopes(node: Expr, wanted: tuple[Expr, ...], differentiate: Differentiate) -> list[list[Expr]]:
-    """In each of these symbols."""
+    """Slopes in each of these symbols."""
     first, fixed, _ = parts(node)
     begun = [tuple(differentiate(first, w)) for w in wanted]
     outer = [tuple(differentiate(fixed, w)) for w in wanted]
@@ -45,7 +45,7 @@ def _slopes(node: Expr, wanted: tuple[Expr, ...], differentiate: Differentiate) 
 
 
 def _in_arguments(node: Expr, differentiate: Differentiate) -> list[list[Expr]]:
-    """In each argument but the number of times: what does for any number of symbols."""
+    """Slopes in each argument but the number of times: what does for any number of symbols."""
     n, m = node.data.states, node.data.fixed
     unit = [[constant(float(i == k)) for i in range(n + m)] for k in range(n + m)]
     begun, outer = [tuple(u[:n]) for u in unit], [tuple(u[n:]) for u in unit]

@@ -27,8 +27,9 @@ RESOLVED = 1e-13
 
 @dataclass(frozen=True)
 class Moments:
-    """Of x_t in each of L lanes: mean (L, D) and covariance (L, D, D) given y_{1:t}, predicted
-    (L, D) and its covariance (L, D, D) given y_{1:t-1}, cross (L, D, D) of x_{t-1} with x_t."""
+    """Moments of x_t in each of L lanes: mean (L, D) and covariance (L, D, D) given y_{1:t},
+    predicted (L, D) and its covariance (L, D, D) given y_{1:t-1}, cross (L, D, D) of x_{t-1} with
+    x_t."""
 
     mean: np.ndarray
     covariance: np.ndarray

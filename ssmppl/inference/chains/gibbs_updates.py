@@ -47,7 +47,7 @@ class GibbsUpdates:
 
     @cached_property
     def positions(self) -> list[np.ndarray]:
-        """Of each update's components in theta."""
+        """Positions of each update's components in theta."""
         return [np.array([self.index[c] for c in u.components]) for u in self.updates]
 
     @cached_property

@@ -208,7 +208,7 @@ def _jump_chains(
     setup: SamplingSetup, method: ISMCMC, gaussian: GaussianPilot, length: int,
     executor: Executor | None, progress: bool,
 ) -> JumpChains:  # fmt: skip
-    """Phase 1."""
+    """The jump chains of phase 1."""
     where = coordinates(setup.space, "unconstrained", None)
     runs = ApproximateRuns(_likelihood(setup.problem, method, gaussian))
     like = MetropolisHastings(target_acceptance=method.target_acceptance)

@@ -587,6 +587,6 @@ class WalkAndIndependence(RandomWalk):
         return np.linalg.inv(self.factor)
 
     def _log_density(self, w: np.ndarray) -> float:
-        """Of t at w, up to a constant."""
+        """Log density of t at w, up to a constant."""
         white, d = self._inverse @ (w - self.centre), len(w)
         return -0.5 * (DEGREES + d) * float(np.log1p(white @ white / DEGREES))

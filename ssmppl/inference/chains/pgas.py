@@ -115,7 +115,8 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
 
 
 def csmc_settings(problem: Problem, particles: int | None, proposal: str) -> FilterSettings:
-    """Of the conditional particle filter: what was asked for, else what suits the model."""
+    """Settings of the conditional particle filter: what was asked for, else what suits the
+    model."""
     if proposal == "auto":
         proposal = choose_for_csmc(problem)
     problem.proposal(proposal)

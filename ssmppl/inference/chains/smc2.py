@@ -134,7 +134,7 @@ class SMC2State:
 
     @property
     def size(self) -> int:
-        """N."""
+        """The number N of particles."""
         return len(self.filters[0].w)
 
     def weights(self) -> np.ndarray:

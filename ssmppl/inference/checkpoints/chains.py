@@ -80,12 +80,12 @@ class CheckpointFile(Checkpoint):
 
     @property
     def root(self) -> np.random.SeedSequence:
-        """Of all random numbers."""
+        """The seed of all random numbers."""
         return np.random.SeedSequence(self.entropy)
 
     @property
     def seconds(self) -> float:
-        """Spent so far, in all calls."""
+        """Seconds spent so far, in all calls."""
         return self._before + time.perf_counter() - self._begun
 
     def once(self, name: str, make: Callable[[], Any]) -> Any:
@@ -182,7 +182,7 @@ class CheckpointFile(Checkpoint):
         self._cost = self._written - begin
 
     def _stat(self) -> tuple[int, ...] | None:
-        """By which a file is known again; None: there is none."""
+        """The figures by which a file is recognised; None: there is no file."""
         try:
             found = os.stat(self.file)
         except FileNotFoundError:

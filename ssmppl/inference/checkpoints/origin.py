@@ -77,7 +77,7 @@ def origin_of(text: str) -> Origin:
 
 
 def digest(*parts: str) -> str:
-    """Of texts."""
+    """A digest of texts."""
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:20]
 
 
@@ -89,7 +89,7 @@ def text_of(value: Any) -> str:
 
 
 def data_digest(experiments: Sequence[Experiment]) -> str:
-    """Of measurements, gaps, inputs and labels of rows."""
+    """A digest of measurements, gaps, inputs and labels of rows."""
     return digest(*(_data(e) for e in experiments))
 
 
@@ -103,7 +103,7 @@ def _data(e: Experiment) -> str:
 
 
 def model_digest(trace: Trace) -> str:
-    """Of distributions and expressions, without where they were written."""
+    """A digest of distributions and expressions, without where they were written."""
     lines = [trace.name, repr(trace.inputs)]
     lines += [repr(trace.time_step)] if trace.time_step else []
     roots: list[Expr] = []
@@ -135,14 +135,14 @@ def _roots(site: Site) -> list[Expr]:
 
 @cache
 def sources_digest(*folders: str) -> str:
-    """Of the sources that numbers come from, by folder of the package."""
+    """A digest of the sources that numbers come from, by folder of the package."""
     package = Path(__file__).parents[2]
     return digest(*(f.read_text(encoding="utf-8") for folder in folders
                     for f in sorted((package / folder).rglob("*.py"))))  # fmt: skip
 
 
 def versions() -> dict[str, str]:
-    """Of this package, by its sources, and of all else that the digits depend on."""
+    """Versions of this package, by its sources, and of all else that the digits depend on."""
     own = sources_digest("expressions", "language", "data", "analysis", "codegen", "inference")
     return {
         "ssmppl": f"{_version('ssmppl')} (sources {own[:8]})",

@@ -279,7 +279,7 @@ class HiddenMarkov(Scored):
         return self.filter_each([experiment], theta)[0]
 
     def filter_each(self, experiments: Sequence[Experiment], theta: np.ndarray) -> list[Filtered]:
-        """As `filter`, of each experiment.
+        """Filter each experiment, as `filter` does one.
 
         Raises
         ------

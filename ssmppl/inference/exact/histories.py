@@ -43,7 +43,7 @@ class Histories:
 
     @property
     def size(self) -> int:
-        """S."""
+        """The number S of distinct data sets."""
         return len(self.weights)
 
     @property

@@ -34,7 +34,7 @@ class LaplaceLikelihood:
         self.modes = [None] * len(self.problem.experiments)
 
     def __call__(self, theta: np.ndarray) -> float:
-        """At theta (P,); -inf where there is no mode."""
+        """The approximate log-likelihood at theta (P,); -inf where there is no mode."""
         total = 0.0
         for i, (e, mode) in enumerate(zip(self.problem.experiments, self.modes, strict=True)):
             found = self.approximation.laplace(

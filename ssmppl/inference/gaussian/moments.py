@@ -195,7 +195,7 @@ class ApproximateKalman:
 
 
 def _gains(found: FilterMoments) -> list[np.ndarray]:
-    """Of each row but the first (D, D): how x_{t-1} goes with x_t less its prediction."""
+    """Gains of each row but the first, (D, D): how x_{t-1} goes with x_t less its prediction."""
     out = [np.zeros_like(found.cross[0])]
     for cross, covariance in zip(found.cross[1:], found.predicted_covariance[1:], strict=True):
         scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))

@@ -60,7 +60,10 @@ SIDE_BY_SIDE = 2  # climbs beside the first
 
 
 def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
-    """Maximise; see the module.
+    """The maximum of the likelihood, or of the posterior density, by direct optimisation.
+
+    setup : model, data, start and objective. method : its settings. The `Ascent` has the end, the
+    iterates and the report.
 
     Raises
     ------

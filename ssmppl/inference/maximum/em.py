@@ -144,7 +144,10 @@ CALM = 2  # cycles in a row that have to find the limit near
 
 
 def climb(setup: Maximization, method: EM) -> Ascent:
-    """Maximise; see the module.
+    """The maximum of the likelihood, or of the posterior density, by EM.
+
+    setup : model, data, start and objective. method : its settings. The `Ascent` has the end, the
+    iterates and the report.
 
     Raises
     ------

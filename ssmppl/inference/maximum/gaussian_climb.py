@@ -250,7 +250,7 @@ class _Corrected:
 
 
 class _Correction:
-    """From the top of L to that of the likelihood.
+    """The steps from the maximum of L to that of the likelihood.
 
     z : (F,) where L has its top, information (F, F) minus its second derivatives there.
     """

@@ -232,7 +232,10 @@ def _estimates(
 
 
 def climb(setup: Maximization, method: IF2) -> Ascent:
-    """Maximise; see the module.
+    """The maximum of the likelihood, or of the posterior density, by iterated filtering.
+
+    setup : model, data, start and objective. method : its settings. The `Ascent` has the end, the
+    iterates and the report.
 
     Raises
     ------

@@ -41,7 +41,10 @@ from ssmppl.inference.run.seeds import random_state
 
 
 def climb(setup: Maximization, method: PSAEM) -> Ascent:
-    """Maximise; see the module.
+    """The maximum of the likelihood, or of the posterior density, by stochastic approximation EM.
+
+    setup : model, data, start and objective. method : its settings. The `Ascent` has the end, the
+    iterates and the report.
 
     Raises
     ------

@@ -79,7 +79,10 @@ class _Iterations:
 
 
 def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
-    """Maximise; see the module.
+    """The maximum of the likelihood, or of the posterior density, by score ascent.
+
+    setup : model, data, start and objective. method : its settings. The `Ascent` has the end, the
+    iterates and the report.
 
     Raises
     ------

@@ -83,7 +83,7 @@ def _ends(shares: np.ndarray, particles: int) -> np.ndarray:
 
 
 def _status(sums: np.ndarray) -> int:
-    """Of all blocks together, as `normalise` and the kernel `particle_filter` tell it."""
+    """Status of all blocks together, as `normalise` and the kernel `particle_filter` tell it."""
     found = sums[:, 2]
     if (found == NAN).any():
         return NAN if sums[:, 3].any() else ALL_ZERO

@@ -1,4 +1,4 @@
-"""Runs of the particle filter: the likelihood, and everything else that a filter tells.
+"""Runs of the particle filter: log-likelihood, moments, quantiles, ESS and one-step predictions.
 
 Algorithm 2 of Schön et al. (2015); see `codegen/kernels/particle/particle_filter.py`.
 """
@@ -201,7 +201,7 @@ def log_of_mean(log_z: np.ndarray) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class FilterRun:
-    """What one run of the filter tells about one experiment (T steps, D states, K channels).
+    """Results of one run of the filter for one experiment (T steps, D states, K channels).
 
     log_increments, ess : (T,). mean : (T, D). covariance : (T, D, D). quantiles : (T, P, D).
     prediction : (T, 4, K): mean, variance, P(Y <= y) and P(Y < y) of the one-step prediction.

@@ -68,7 +68,7 @@ def filter_of(model: ExactModel) -> str:
 
 
 def filter_name(model: ExactModel) -> str:
-    """In words."""
+    """The name of the filter behind a model, in words."""
     return FILTER_NAME[type(model)]
 
 

@@ -75,7 +75,8 @@ class ExactScore:
 def exact_score(
     model: ExactModel, experiments: Sequence[Experiment], free: np.ndarray, theta: np.ndarray
 ) -> ExactScore:
-    """By sensitivities if these exist at theta (P,), else by differences, with the reason."""
+    """The score by sensitivities if these exist at theta (P,), else by differences, with the
+    reason."""
     try:
         model.score(experiments, theta, free)
     except ArgumentError as reason:

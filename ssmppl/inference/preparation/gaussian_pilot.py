@@ -61,7 +61,7 @@ class GaussianPilot:
 
     @property
     def pilot(self) -> Pilot:
-        """As the starts of chains know it."""
+        """The pilot in the form that the starts of chains use."""
         return Pilot(self.z, np.sqrt(np.diagonal(self.covariance)), self.log_density)
 
     @property

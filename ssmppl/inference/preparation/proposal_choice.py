@@ -135,8 +135,8 @@ def choose_by_pilot(
 
 
 def choose_for_csmc(problem: Problem) -> str:
-    """For conditional SMC, without a pilot: the user's, else the locally optimal one where it is
-    exact, else the transition."""
+    """The proposal for conditional SMC, without a pilot: the user's, else the locally optimal one
+    where it is exact, else the transition."""
     proposals = problem.program.proposals
     if "user" in proposals:
         return "user"
@@ -147,7 +147,7 @@ def choose_for_csmc(problem: Problem) -> str:
 
 
 def digest_of(problem: Problem) -> bytes:
-    """Of the data."""
+    """A digest of the data."""
     digest = hashlib.sha256()
     for e in problem.experiments:
         for a in (e.y, e.seen, e.u):

@@ -130,7 +130,7 @@ def _ranked(draws: np.ndarray) -> np.ndarray:
 
 
 def _r_hat(z: np.ndarray) -> float:
-    """Of chains (m, n); NaN where nothing varies."""
+    """R-hat of chains (m, n); NaN where nothing varies."""
     n = z.shape[1]
     within, between = z.var(axis=1, ddof=1).mean(), n * z.mean(axis=1).var(ddof=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -236,9 +236,9 @@ def random_components(problem: Problem, steps: int) -> tuple[np.ndarray, np.ndar
 
 @np.errstate(invalid="ignore", over="ignore")  # of states that overflow, which say nothing here
 def movement(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each chain's draws (draws, T, D), which may lie on disk and are read in pieces: the share
-    of successive draws that differ, whether any differ, and R-hat, 1 where draws are not finite;
-    (T, D) each."""
+    """Movement of each chain's draws (draws, T, D), which may lie on disk and are read in pieces:
+    the share of successive draws that differ, whether any differ, and R-hat, 1 where draws are not
+    finite; (T, D) each."""
     n, shape = len(paths[0]), paths[0].shape[1:]
     size = max(1, PIECE // max(1, len(paths) * paths[0][0].nbytes))
     changed, ever = np.zeros(shape, dtype=int), np.zeros(shape, dtype=bool)

@@ -30,7 +30,7 @@ class Block:
 
     @classmethod
     def of(cls, draws: Mapping[str, Sequence[Any]], stats: Mapping[str, Sequence[Any]]) -> Block:
-        """From what was drawn one after the other."""
+        """A block of what was drawn one after the other."""
         return cls(*({name: np.array(v) for name, v in own.items()} for own in (draws, stats)))
 
 
@@ -56,7 +56,7 @@ class ChainDraws(Generic[State]):
     lost: ExecutorError | None = None
 
     def then(self, later: ChainDraws[State]) -> ChainDraws[State]:
-        """With the draws that the chain made from where it stood."""
+        """These draws with the later ones of the same chain."""
         draws, stats = joined([self.draws, later.draws]), joined([self.stats, later.stats])
         return replace(later, draws=draws, stats=stats, warmup_stats=self.warmup_stats)
 

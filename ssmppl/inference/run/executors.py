@@ -164,7 +164,7 @@ def lost_worker(error: BaseException) -> ExecutorError | None:
 
 
 def error_of(future: Future[Any]) -> BaseException | None:
-    """Of a future that is done; one may be cancelled by its executor, too."""
+    """The error of a future that is done; one may be cancelled by its executor, too."""
     return CancelledError() if future.cancelled() else future.exception()
 
 

@@ -70,7 +70,7 @@ class Problem:
 
     @property
     def rows(self) -> int:
-        """Of all data sets together."""
+        """The number of rows of all data sets together."""
         return sum(e.steps for e in self.experiments)
 
     @cached_property

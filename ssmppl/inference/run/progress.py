@@ -120,8 +120,8 @@ def announced(title: str, what: str, shown: bool = True) -> Iterator[None]:
 
 
 def _shape() -> dict[str, Any]:
-    """As wide as the terminal, also once that is changed; where it does not tell its size, as
-    within some containers and editors, and no bar would fit, 80 columns."""
+    """Settings of a bar as wide as the terminal, also once that is changed; where it does not tell
+    its size, as within some containers and editors, and no bar would fit, 80 columns."""
     try:
         known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except (OSError, ValueError, AttributeError):
@@ -130,7 +130,7 @@ def _shape() -> dict[str, Any]:
 
 
 def _colour() -> str | None:
-    """Of the bar; none where NO_COLOR is set, or the terminal has none."""
+    """The colour of the bar; none where NO_COLOR is set, or the terminal has none."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     return None if plain else "cyan"
 

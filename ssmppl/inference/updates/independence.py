@@ -266,7 +266,8 @@ def factor_of(covariance: np.ndarray) -> np.ndarray:
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:
-    """Of an information that need not be positive definite: eigenvalues count by their size."""
+    """The inverse of an information that need not be positive definite: eigenvalues count by their
+    size."""
     if not len(information):
         return information
     scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), 1e-10))

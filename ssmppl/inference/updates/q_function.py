@@ -135,6 +135,6 @@ class _Mode:
 
 
 def _positions(step: MStep, components: Sequence[Expr]) -> np.ndarray:
-    """Of components in theta."""
+    """Positions of components in theta."""
     place = {s: i for i, s in enumerate(step.trace.parameter_symbols)}
     return np.array([place[c] for c in components])

@@ -306,7 +306,8 @@ def _update(update: Update) -> tuple[str, str]:
 
 
 def explain(model: Model, data: Any = None) -> Plan:
-    """What is derived from the model, and why: structure, proposals, one update per parameter.
+    """The structure, proposals, default methods and Gibbs updates derived from a model, with
+    reasons.
 
     Parameters
     ----------

@@ -54,7 +54,7 @@ def particle_filter(
     seed: int | None = None,
     executor: Executor | None = None,
 ) -> xr.Dataset | list[xr.Dataset]:
-    """Run the particle filter and tell what it found.
+    """Filter means, quantiles, log-likelihood and ESS at given parameters, as a Dataset.
 
     With proposal="twisted" the particles know what comes later: their sum of log-likelihood
     increments is worth most, while few of them tell the moments at single rows. "auto" leaves it
@@ -166,7 +166,8 @@ def filter_dataset(
     problem: Problem, experiment: Experiment, runs: list[FilterRun], levels: np.ndarray,
     attrs: dict[str, Any], root: np.random.SeedSequence,
 ) -> xr.Dataset:  # fmt: skip
-    """What the runs (one per draw) tell of one experiment; the variables of `particle_filter`.
+    """The results of the runs (one per draw) for one experiment: the variables of
+    `particle_filter`.
 
     root : of the random numbers by which PIT values of discrete channels are spread.
     """
@@ -415,7 +416,7 @@ def forward_filter(
 def _probabilities(
     exact: HiddenMarkov, law: np.ndarray, dataset: xr.Dataset
 ) -> dict[str, xr.DataArray]:
-    """Of each state's values, from the distributions (T, K) of their combinations."""
+    """Probabilities of each state's values, from the distributions (T, K) of their combinations."""
     import xarray as xr
 
     out = {}

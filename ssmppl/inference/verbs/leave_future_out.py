@@ -251,7 +251,7 @@ def _some_increments(
     problem: Problem, theta: np.ndarray, settings: FilterSettings | None,
     root: np.random.SeedSequence, which: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Of some of the draws; a function that another process can be sent."""
+    """Increments of some of the draws; a function that another process can be sent."""
     (e,) = problem.experiments
     out = np.full((len(which), e.steps), -np.inf)
     model = exact_model(problem.trace)

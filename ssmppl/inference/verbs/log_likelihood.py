@@ -1,4 +1,4 @@
-"""The verb `log_likelihood`."""
+"""The verb `log_likelihood`: log p(y | theta), exact or by unbiased particle estimates."""
 
 from __future__ import annotations
 

@@ -280,7 +280,8 @@ def _information(setup: Maximization, theta: np.ndarray, found: Edges | None) ->
 
 
 def _score_of(setup: Maximization, found: Edges | None) -> ExactScore:
-    """Of an exact likelihood, in what is free and not held at an edge that stays where it is."""
+    """The score of an exact likelihood, in what is free and not held at an edge that stays where it
+    is."""
     free = free_components(setup.problem.trace, setup.fixed)
     free[[] if found is None else [i for i in found.components if i not in found.moving]] = False
     return setup.exact_score(free)

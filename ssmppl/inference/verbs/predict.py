@@ -46,7 +46,7 @@ def group(idata: Any, name: str) -> Any:
 
 
 def posterior_of(idata: Any, fix: str = "give what ssm.sample returns") -> Any:
-    """Its posterior.
+    """The posterior group of a result.
 
     Raises
     ------

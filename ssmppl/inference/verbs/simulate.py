@@ -1,4 +1,4 @@
-"""The verb `simulate`."""
+"""The verb `simulate`: draws of states and observations at given parameters."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def check_indexes(trace: Trace) -> None:
 
 
 def _values(trace: Trace) -> dict[Expr, _Values]:
-    """Of each state, before too, and each parameter."""
+    """Values of each state, before too, and of each parameter."""
     values: dict[Expr, _Values] = {}
     points: list[tuple[Expr, Expr]] = []
     for sites in (trace.parameters, trace.initial, trace.transition):

@@ -23,7 +23,7 @@ RESERVED = {
 
 
 def a(role: str) -> str:
-    """With its article."""
+    """The role with its article."""
     return f"an {role}" if role[0] in "aeiou" else f"a {role}"
 
 

@@ -46,7 +46,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Of the support: numbers, or names of arguments; whether they belong to it."""
+    """Bounds of the support: numbers, or names of arguments; whether they belong to it."""
 
     lower: float | str = -INFINITY
     upper: float | str = INFINITY
@@ -55,7 +55,7 @@ class Bounds:
 
     @property
     def values(self) -> np.ndarray | None:
-        """Of a discrete distribution between numbers not far apart, all that it may give."""
+        """All values of a discrete distribution between numbers not far apart."""
         if not self.discrete or isinstance(self.lower, str) or isinstance(self.upper, str):
             return None
         few = self.upper - self.lower < MOST_LISTED

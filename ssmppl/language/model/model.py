@@ -290,7 +290,7 @@ class Model:
 
 
 def _source(function: Callable[..., Any]) -> str:
-    """Its text; empty where that is not at hand."""
+    """The text of a function; empty where that is not at hand."""
     try:
         return textwrap.dedent(inspect.getsource(plain_function(function))).strip()
     except (OSError, TypeError):
