@@ -112,7 +112,7 @@ def _objects(plain: np.ndarray) -> np.ndarray | Fault:
                 index,
                 f"{'the text ' if text else ''}{short(entry)} stands where a number is expected",
                 "convert the column, for example by pd.to_numeric(column, errors='coerce'), "
-                "which writes NaN for what is no number"
+                "which writes NaN for what is not a number"
                 if text and some
                 else "give numbers, NaN where a value is missing",
             )

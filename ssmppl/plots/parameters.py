@@ -144,8 +144,8 @@ def plot_maximization(estimate: Any, *, var_names: Any = None, ax: Any = None) -
 
     The dashed line is the estimate, the band one standard error on both sides; there is no band
     where the information at the estimate was not positive definite. Below, where the method knows
-    it, what was maximised: the log-likelihood of the exact methods; of `IF2` the one that its swarm
-    of perturbed parameters had, which is no log-likelihood of theirs. Of several starts, one line
+    it, what was maximised: the log-likelihood of the exact methods; of `IF2` the one that its
+    perturbed particles had, which is no log-likelihood of theirs. Of several starts, one line
     each.
 
     Parameters

@@ -186,7 +186,10 @@ def test_the_methods_chosen_without_one_are_not_refused():
 
 def test_explain_says_why():
     text = " ".join(str(ssm.explain(acceleration(), data())).split())
-    assert "MetropolisHastings: linear Gaussian, and the covariance in the transition" in text
+    assert (
+        "MetropolisHastings: the model is linear Gaussian, and the covariance in the transition"
+        in text
+    )
     assert "none the covariance in the transition of x is singular (rank 1 of 2)" in text
 
 

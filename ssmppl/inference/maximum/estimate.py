@@ -41,7 +41,7 @@ class Estimate:
     log_likelihood : at the estimate; with particles an estimate, whose standard error is
         `attrs["log_likelihood_error"]`.
     iterates : Dataset with dim `iteration`, the way to the estimate; of `IF2` with dim `start` too,
-        and with `perturbed_log_likelihood`, what the swarm's particle filter made of each pass. Of
+        and with `perturbed_log_likelihood`, what the particle filter made of each pass. Of
         exact methods with `objective`, the log-likelihood, with the log prior density where the
         posterior was maximised. Where a parameter has such a name, an underscore follows theirs.
     attrs : method, why it was taken, `converged`, `interrupted`, seed, seconds; where random

@@ -89,11 +89,11 @@ def sample(
         None: for the former Gibbs if every parameter has a closed-form conditional (with
         `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
         while the parameters are few; for the others PMMH where a pilot finds that twisted particle
-        filters of at most 64 particles estimate it precisely (sd of log Z at most 0.3), with up to
-        12 free numbers; else PGAS, likewise with `interweave="auto"`, or PMMH where no ancestors
-        can be sampled, the data are long or the states counts, and the parameters are few.
-        `explain` and the attributes say which, and why. Chains of a method that was chosen like
-        this and have not mixed (R-hat above 1.01 or a bulk ESS below 400, where there are 4000
+        filters of at most 64 particles estimate the likelihood precisely (sd of log Z at most 0.3),
+        with up to 12 free numbers; else PGAS, likewise with `interweave="auto"`, or PMMH where no
+        ancestors can be sampled, the data are long or the states counts, and the parameters are
+        few. `explain` and the attributes say which, and why. Chains of a method that was chosen
+        like this and have not mixed (R-hat above 1.01 or a bulk ESS below 400, where there are 4000
         draws of all chains; 1.05 and 100 of fewer) go on to twice and, if need be, four times the
         draws, of which the first half then counts as warmup and the second is thinned to as many
         draws as were asked for; the attribute `further_draws` says how many were made.

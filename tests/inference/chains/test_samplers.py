@@ -170,7 +170,9 @@ def chosen_observation(x):
 
 def test_choice_by_structure_is_told():
     plan = str(ssm.explain(chosen))
-    assert "Gibbs: linear Gaussian, and every parameter has a closed-form" in " ".join(plan.split())
+    assert "Gibbs: the model is linear Gaussian, and every parameter has a closed-form" in " ".join(
+        plan.split()
+    )
     idata = ssm.sample(chosen, {"y": np.array([0.3, 0.1, -0.2])}, **SHORT)
     assert idata["posterior"].attrs["method"] == "Gibbs"
     assert "closed-form" in idata["posterior"].attrs["method_reason"]
@@ -182,7 +184,7 @@ def test_choice_by_structure_is_told():
     model.prior(lambda: {"w": ssm.Uniform(0, 3)})
     model.transition(lambda x, w: {"x": ssm.Normal(np.cos(w) * x, sd=0.5)})
     plan = " ".join(str(ssm.explain(model)).split())
-    assert "MetropolisHastings: linear Gaussian, but w has no closed-form conditional" in plan
+    assert "the model is linear Gaussian, but w has no closed-form conditional" in plan
     assert "PGAS: the model is not linear" in " ".join(str(ssm.explain(nonlinear)).split())
 
 

@@ -399,7 +399,7 @@ def test_an_estimate_at_the_edge_of_its_support_says_so():
     )
     assert found.attrs["at_edge"] == {"p": 1.0}
     (note,) = found.notes
-    assert note.startswith("p is within a standard error of 1, the edge")
+    assert note.startswith("p is within a standard error of 1, the boundary")
     half = ssm.maximize(
         model, {"y": np.arange(30.0) % 2, "z": z}, seed=1, progress=False, fixed={"q": 0.0}
     )
