@@ -19,7 +19,7 @@ from ssmppl.analysis.structure import simulators
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
-from ssmppl.diagnosis.heldout.cross_validation import CrossValidation
+from ssmppl.diagnosis.heldout.cross_validation import FOLDS_CALLED, CrossValidation
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
 from ssmppl.diagnosis.heldout.predictions import Predictions, predict
 from ssmppl.diagnosis.heldout.row_split import FOLDS, RowSplit, long_enough, three_parts
@@ -154,6 +154,7 @@ class _Diagnosis:
             self.split = three_parts(self.experiments)
         self.called = bool(simulators(self.trace))
         self.sets = SETS["fast" if self.called else mode]
+        self.folds = FOLDS_CALLED if self.called else FOLDS
         missing = self.problem.program.missing
         if mode == "full" and self.split is None:  # blocks of rows will be set missing
             missing = replace(missing, none=False)
@@ -304,7 +305,7 @@ class _Diagnosis:
             return HeldOutRows(
                 self.augmented, self.split, (r.base, r.fit), r.screen, r.chosen, best
             ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)
-        r.blocks = FOLDS
+        r.blocks = self.folds
         augmented, design, base = self.augmented, r.screen.design, (r.base, r.fit)
         if self.split:  # the code so far knows no missing rows
             missing = replace(self.augmented.missing, none=False)
@@ -373,7 +374,7 @@ class _Diagnosis:
         )
         for_fit, _ = timed(lambda: base.smoother.run(experiments, fit.theta, stream()))
         of_climbs = base.seconds_of_value(experiments, fit.theta)
-        blocks = 0 if self.split else FOLDS
+        blocks = 0 if self.split else self.folds
         rest = expected(
             Timed(for_screen, for_fit, generating, of_climbs), self.sets, self.mode, blocks,
             self.checkpoint.executor, simulator=self.called,

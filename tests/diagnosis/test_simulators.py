@@ -4,6 +4,10 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.model.score_columns import score_columns
+from ssmppl.diagnosis.model.smoothing import Settings, Smoother
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 
 T, H, STEPS = 150, 0.01, 5
 
@@ -44,6 +48,56 @@ def record(dry, seed):
         y.append(x[0, 0] + 0.01 * rng.standard_normal())
         x = swung(x, torque, 9.0, 0.3, dry) + [[0.0, 0.04 * rng.standard_normal()]]
     return {"y": np.array(y), "u": u}
+
+
+def trend(function):
+    """A level and a slope, which `function` moves."""
+    made = ssm.Model("trend")
+    made.prior(lambda: {"a": ssm.Uniform(0, 1), "s": ssm.LogNormal(-1, sd=1)})
+    made.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=0.5)})
+
+    @made.transition
+    def transition(x, v, a, s):
+        level, slope = function(x, v, a)
+        return {"x": ssm.Normal(level, sd=0.3), "v": ssm.Normal(slope, sd=s)}
+
+    made.observation(lambda x: {"y": ssm.Normal(x, sd=0.4)})
+    return made
+
+
+def passed(model, y):
+    problem = pose(model, {"y": y})
+    t, missing = problem.trace, problem.program.missing
+    smoother = Smoother(score_columns(t, t, (), (), missing), missing, Settings(100, "twisted"))
+    (found,) = smoother.run(
+        problem.experiments, np.array([0.8, 0.2]), random_state(seed_sequence(3))
+    )
+    return found
+
+
+def test_predictions_of_a_linear_simulator_are_those_of_the_exact_filter():
+    """The mean to rounding, as draws are mirrored; the variance by 64 pairs of them."""
+
+    @ssm.simulator(state=["x", "v"], parameters=["a"])
+    def called(state, inputs, parameters):
+        x, v = state.T
+        return np.stack([x + v, parameters[:, 0] * v], axis=1)
+
+    def step(x, v, a):
+        new = called([x, v], [], [a])
+        return new.x, new.v
+
+    y = np.cumsum(np.random.default_rng(4).normal(size=40))
+    y[[5, 6, 20]] = np.nan
+    found, exact = passed(trend(step), y), passed(trend(lambda x, v, a: (x + v, a * v)), y)
+    np.testing.assert_allclose(found.log_increments, exact.log_increments, atol=1e-5)
+    seen = np.isfinite(y)
+    mean, variance, below, _ = found.prediction[seen, :, 0].T
+    m, v, p, _ = exact.prediction[seen, :, 0].T
+    np.testing.assert_allclose(mean, m, atol=1e-5)
+    # of the sample variance of 64 normal draws, whose sd is sqrt(2 / 64) of it
+    assert np.all(np.abs(variance / v - 1.0) < 4.5 * np.sqrt(2.0 / 64))
+    assert np.all(np.abs(below - p) < 0.1)
 
 
 @pytest.mark.slow

@@ -3,9 +3,10 @@
 Contiguous blocks of rows are set missing in turn; fit and selection are repeated on the rest, the
 latter among the `SINGLES` leading effects, pairs of them and steps from the best, with the shapes
 that the screen has, up to as many effects as were chosen on all rows (M. Stone, *JRSS B* 36, 1974;
-blocks for dependent rows: P. Burman, E. Chow and D. Nolan, *Biometrika* 81, 1994). l_b is the sum
-of the one-step log predictive densities of the block's rows, the filter run over all rows with what
-the other blocks gave: the quantity that is measured on the held-out rows of longer records. (log
+blocks for dependent rows: P. Burman, E. Chow and D. Nolan, *Biometrika* 81, 1994). Where a
+simulator is called there are fewer blocks, of single effects and pairs alone. l_b is the sum of the
+one-step log predictive densities of the block's rows, the filter run over all rows with what the
+other blocks gave: the quantity that is measured on the held-out rows of longer records. (log
 p(y_b | y_-b) would look ahead: there a noisy level bridges the break that it does not know from
 both sides, and hardly a gap is left.)
 """
@@ -18,6 +19,7 @@ from functools import partial
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated
 from ssmppl.diagnosis.heldout.gain_ratio import FEWEST_BLOCKS, NOT_GIVEN, HeldOutGain, gain_ratio
@@ -37,6 +39,7 @@ from ssmppl.inference.verbs.simulate import feeds_back
 
 SETS = 60  # simulated data sets in each fold
 SINGLES = 4  # refits in each fold
+FOLDS_CALLED, SINGLES_CALLED = FEWEST_BLOCKS, 2  # likewise, of a model that calls a simulator
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class CrossValidation:
         out = HeldOutGain()
         out.simulate(self.base, self.experiments, self.chosen, seed)
         fed_back = feeds_back(self.augmented.trace)
-        blocks = folds(self.experiments, FOLDS, fed_back=fed_back)
+        number = FOLDS_CALLED if simulators(self.augmented.trace) else FOLDS
+        blocks = folds(self.experiments, number, fed_back=fed_back)
 
         def one(k: int) -> Numbers:
             name = f"block {k + 1} of {len(blocks)}"
@@ -156,9 +160,11 @@ class CrossValidation:
             screen = screen_part(self.whole, fold.train, fit.theta, seed)
         found = SelectionResult(fit)
         if self.chosen is not None:
+            called = bool(simulators(self.augmented.trace))
             EffectSelection(
                 self.augmented, screen, fold.train, seed, self.alpha, checkpoint, always=True,
-                singles=SINGLES, most=len(self.chosen.candidates), approximate=True,
+                singles=SINGLES_CALLED if called else SINGLES, approximate=True,
+                most=len(self.chosen.candidates), further=not called,
             ).run(found)  # fmt: skip
         chosen = found.chosen
         reference = fit_reference(

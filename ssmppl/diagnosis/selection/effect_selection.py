@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
@@ -38,6 +39,7 @@ AFRESH = "refitting from default start"
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is run
 FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
+AGAIN_CALLED = 60  # likewise, of a model that calls a simulator
 
 
 @dataclass
@@ -71,7 +73,8 @@ class EffectSelection:
     screen, train : of the same experiments. alpha : family-wise error rate. always : choose the
     best one even where the screen finds nothing. singles : how many are refitted; None: the
     leading ones and what correlates with them. most : effects in all. approximate : by approximate
-    fits (`Effort`), without standard errors.
+    fits (`Effort`), without standard errors. further : whether screens run again around what was
+    chosen look for more.
     """
 
     augmented: AugmentedModels
@@ -84,6 +87,7 @@ class EffectSelection:
     singles: int | None = None
     most: int = MOST_EFFECTS
     approximate: bool = False
+    further: bool = True
 
     def run(self, out: SelectionResult) -> None:
         """Refit, choose, and step forward; into `out`, which keeps what came before an error."""
@@ -102,11 +106,12 @@ class EffectSelection:
             with guard("pairs of effects"):
                 rival = self._best_pair(out)
             # a step from the best one, against the best pair
-            with guard("whether a second effect is missing"):
-                self._forward(out, 2)
+            if self.further:
+                with guard("whether a second effect is missing"):
+                    self._forward(out, 2)
             if rival is not None and rival.penalised_gain > out.chosen.penalised_gain:
                 out.chosen = rival
-            if len(out.chosen.candidates) == 2:
+            if len(out.chosen.candidates) == 2 and self.further:
                 pair = out.chosen
                 with guard("whether a third effect is missing"):
                     self._forward(out, self.most)
@@ -284,8 +289,9 @@ class EffectSelection:
             simulator=fitter.simulator if fitter.initial_law else None,
             failures=self.checkpoint.failures,
         )  # fmt: skip
+        sets = AGAIN_CALLED if simulators(self.augmented.trace) else AGAIN
         return run_screen(
-            design, self.train, chosen.fit.theta, min(self.screen.sets, AGAIN), seed,
+            design, self.train, chosen.fit.theta, min(self.screen.sets, sets), seed,
             self.checkpoint, f"screening for effect {len(chosen.candidates) + 1}", checks=False,
         )  # fmt: skip
 

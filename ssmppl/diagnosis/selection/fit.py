@@ -384,7 +384,8 @@ class Fitter:
         fit = self._better_of(None, there, top, seed)
         if effort.approximate:
             return fit
-        z, mask = hold_at_bounds(density_of(there, smooth), fit.z, ~there.on_the_line)
+        level = flat_outwards(densities, fit.z) & ~there.on_the_line
+        z, mask = hold_at_bounds(density_of(there, smooth), fit.z, level)
         if not mask.any():
             return fit
         theta = there.parameters(z)[0].copy()
@@ -740,6 +741,15 @@ def hold_at_bounds(
             mask[i] = True
             break
     return z, mask
+
+
+def flat_outwards(function: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -> np.ndarray:
+    """(F,) bool: which may have run to a bound, as the first step outwards costs nothing; by the
+    function (B, F) -> (B,) of many points at once."""
+    steps = OUTWARDS[0] * np.eye(len(z))
+    here, *away = function(np.vstack([z[None], z + steps, z - steps]))
+    found: np.ndarray = np.any(np.reshape(away, (2, -1)) >= here - FREE, axis=0)
+    return found
 
 
 def component_names(space: Space, mask: np.ndarray) -> list[str]:

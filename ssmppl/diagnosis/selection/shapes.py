@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import SHORTEST, Candidate
 from ssmppl.diagnosis.model.scales import Scales, value_of
@@ -24,6 +25,7 @@ from ssmppl.diagnosis.selection.refit import Refit, effort_for
 from ssmppl.errors import SSMError
 
 SHAPED = 4  # refits at most
+SHAPED_CALLED = 2  # likewise, of a model that calls a simulator
 WITHIN, SHARE = 15.0, 0.4  # so many nats behind the best, or with so much of what it gains
 PRICE = 1.0  # nats that a shape has to gain: one for a parameter (Akaike 1974)
 INSIDE = 0.02  # share of the range from either bound where a fit starts
@@ -61,7 +63,7 @@ def shaped_all(
     tried = [
         i for i, r in enumerate(out)
         if r.penalised_gain >= least and any(shape_bounds(c, scales) for c in r.candidates)
-    ][:SHAPED]  # fmt: skip
+    ][: SHAPED_CALLED if simulators(augmented.trace) else SHAPED]  # fmt: skip
 
     one = partial(_one, augmented, scales, [out[i] for i in tried], tuple(train), seed)
     for i, numbers in zip(tried, checkpoint.map(stage, len(tried), one), strict=True):

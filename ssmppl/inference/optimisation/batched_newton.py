@@ -12,7 +12,7 @@ size (`newton.newton_step`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,13 +27,14 @@ WIDTH = 0.05  # of the steps of differences, in standard deviations by the last 
 FARTHEST = 2.0  # of a step in any coordinate, in units of it where it is larger than one
 LATE = 3  # steps of the others once the highest is at its end
 SHARES = (1.0, 0.5, 0.15, 0.03, 1e-3)  # of a step that are tried
+MUCH = 0.4  # of a step: where less of it is best, its second derivatives were wrong
 GOOD = 1e-7  # that the quadratic still expects to gain, where a climb is at its end
 FINAL = 1e-3  # from where on differences are extrapolated to zero step
 NEAR = 1e-2  # likewise, where a climb that need not be precise is at its end
 SLOPES, CURVATURES, FINE = 1, 2, 3  # what a stencil tells
 
 
-@dataclass
+@dataclass(eq=False)
 class Climber:
     """One of the climbs. size : (F,) of its differences. path : where it has been. stale : whether
     second derivatives are to be taken anew."""
@@ -86,7 +87,7 @@ def climb_together(
         for c in climbers:
             c.information, c.stale = information.copy(), False
             c.size = _sizes(information)
-    _differentiate(function, climbers)
+    _differentiate(function, dict.fromkeys(climbers))
     further = LATE
     for _ in range(STEPS):
         going = [c for c in climbers if not c.ended]
@@ -114,7 +115,7 @@ def _step(function: Function, climbers: list[Climber]) -> None:
         points += own
         counts.append(len(own))
     found = np.split(function(np.array(points)), np.cumsum(counts)[:-1])
-    later = []
+    later: dict[Climber, np.ndarray | None] = {}
     for c, move, values in zip(climbers, moves, found, strict=True):
         shares, stencil = values[: len(SHARES) - 1], values[len(SHARES) - 1 :]
         tried = np.concatenate([stencil[:1], shares])
@@ -125,7 +126,7 @@ def _step(function: Function, climbers: list[Climber]) -> None:
             c.reach *= 0.1
             if not c.ended and not c.stale:
                 c.stale = True
-                later.append(c)
+                later[c] = None
             continue
         c.z, c.value = c.z + SHARES[k] * move, float(tried[k])
         c.path.append(c.z.copy())
@@ -133,20 +134,20 @@ def _step(function: Function, climbers: list[Climber]) -> None:
         if k == 0:
             _take(c, stencil, c.tells, move)
         else:
-            c.stale = True
-            later.append(c)
+            c.stale = c.stale or SHARES[k] < MUCH
+            later[c] = None if c.stale else SHARES[k] * move
     if later:
         _differentiate(function, later)
 
 
-def _differentiate(function: Function, climbers: list[Climber]) -> None:
-    """The derivatives of each where it stands."""
+def _differentiate(function: Function, climbers: Mapping[Climber, np.ndarray | None]) -> None:
+    """The derivatives of each where it stands, with the step that led there, where second
+    derivatives are to be updated by it."""
     sets = [_stencil(c.z, c.size, c.tells) for c in climbers]
     found = function(np.array([z for own in sets for z in own]))
-    for c, values in zip(
-        climbers, np.split(found, np.cumsum([len(s) for s in sets])[:-1]), strict=True
-    ):
-        _take(c, values, c.tells)
+    parts = np.split(found, np.cumsum([len(s) for s in sets])[:-1])
+    for (c, move), values in zip(climbers.items(), parts, strict=True):
+        _take(c, values, c.tells, move)
 
 
 def _stencil(z: np.ndarray, size: np.ndarray, tells: int) -> list[np.ndarray]:

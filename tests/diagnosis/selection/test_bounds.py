@@ -12,6 +12,7 @@ from ssmppl.diagnosis.selection.fit import (
     FROM_START,
     Fitter,
     bounds_note,
+    flat_outwards,
     hold_at_bounds,
     standard_errors,
 )
@@ -49,6 +50,21 @@ def test_what_is_at_no_bound_is_left(function):
     z, mask = hold_at_bounds(function, np.array([0.4]), np.array([True]))
     assert not mask.any()
     assert z[0] == 0.4
+
+
+def test_what_falls_at_the_first_step_outwards_is_at_no_bound():
+    """The first is at a bound below, the second at one above, the third has its top here, and the
+    fourth has no value outside."""
+
+    def one(z):
+        off = np.inf if z[3] > 0.5 else 0.5 * z[3] ** 2
+        return -np.log1p(np.exp(z[0])) - np.log1p(np.exp(-z[1])) - 0.5 * z[2] ** 2 - off
+
+    z = np.array([-20.0, 20.0, 0.0, 0.2])
+    level = flat_outwards(lambda points: np.array([one(p) for p in points]), z)
+    assert level.tolist() == [True, True, False, False]
+    _, mask = hold_at_bounds(one, z, np.ones(4, dtype=bool))
+    assert mask.tolist() == level.tolist()
 
 
 def fits(model, y, exact=True):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.expressions.batched.differences import FIRST, SECOND, Stencil
+from ssmppl.expressions.batched.differences import FIRST, ONE_SIDED, SECOND, Stencil
 
 X = np.array([[0.3, -1.2], [2.0, 0.0], [-0.7, 40.0]])
 WANTED = [(), (0,), (1,), (0, 0), (0, 1), (1, 1)]
@@ -38,6 +38,34 @@ def test_against_those_on_paper(index):
     eps = np.finfo(float).eps
     error = [0.0, 4 * eps / FIRST + 50 * FIRST**2, 16 * eps / SECOND**2 + 50 * SECOND**2]
     assert np.all(np.abs(found - known) <= error[len(index)] * size * 4 + 1e-300)
+
+
+FEW = {  # what is wanted: how many points it takes
+    "slopes": ([(), (0,), (1,)], 3),  # the point itself and one of each
+    "one bent": ([(0,), (1,), (1, 1)], 4),  # and two of what is bent
+    "all bent": (WANTED, 7),  # and two of the mixed one
+}
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_few_points_give_half_the_digits(name):
+    """One-sided: truncation h f'' / 2 and rounding 2 eps f / h; with the points of the second
+    derivative h^2 / 6 times the third one."""
+    asked, (wanted, number) = [], FEW[name]
+
+    def counted(p):
+        asked.append(len(p))
+        return function(p)
+
+    found = Stencil.of(wanted, 2, few=True).derivatives(counted, X, np.ones(2))
+    assert asked == [len(X) * number]
+    size = np.abs(np.stack(exact(X)[()])).max(axis=0) + 1.0
+    eps = np.finfo(float).eps
+    first = max(2 * eps / ONE_SIDED + 50 * ONE_SIDED, 4 * eps / SECOND + 50 * SECOND**2)
+    error = [0.0, first, 16 * eps / SECOND**2 + 50 * SECOND**2]
+    for row, index in zip(found, wanted, strict=True):
+        known = np.stack(exact(X)[index])
+        assert np.all(np.abs(row - known) <= error[len(index)] * size * 4 + 1e-300)
 
 
 def test_one_call_for_all_of_them():

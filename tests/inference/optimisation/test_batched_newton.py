@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.inference.optimisation.batched_newton import NEAR, climb_together
+from ssmppl.inference.optimisation.batched_newton import NEAR, climb_together, information_at
 from ssmppl.inference.optimisation.newton import bfgs_update
 
 H = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, -0.3], [0.2, -0.3, 0.7]])
@@ -49,3 +49,27 @@ def test_the_curvature_that_slopes_build_up_is_near_the_true_one():
     assert along @ found.information @ along == pytest.approx(along @ H @ along, rel=0.5)
     newton = 1 + 2 * 3 + 3 * 2  # points of a stencil with second derivatives
     assert min(asked[2:]) < newton
+
+
+@pytest.mark.parametrize("about", [H, 4.0 * H, np.diag([20.0, 0.3, 0.7])])
+def test_a_curvature_that_is_given_takes_no_points(about):
+    """Also a wrong one, whose climb gets there as well."""
+    asked = []
+
+    def counted(points):
+        asked.append(len(points))
+        return quadratic(points)
+
+    found = climb_together(counted, np.zeros((1, 3)), False, about)
+    away = found.z - TOP
+    assert 0.5 * away @ H @ away < 10.0 * NEAR
+    assert asked[1] == 1 + 2 * 3  # slopes alone
+
+
+def test_second_derivatives_at_a_point():
+    def function(points):
+        return quadratic(points) + 0.1 * np.sum((points - TOP) ** 3, axis=1)
+
+    at = TOP + [0.1, -0.2, 0.3]
+    exact = H - 0.6 * np.diag(at - TOP)
+    np.testing.assert_allclose(information_at(function, at, H), exact, rtol=1e-6, atol=1e-6)
