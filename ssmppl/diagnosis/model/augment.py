@@ -77,10 +77,15 @@ def augment(
     equations = Equations(new, equations)
     for c in late:
         names[c.strength] = auxiliary.add(c, equations, locations)
-    forced = [c for c in late if c.force]
-    pushes = _pushes(forced, equations, names, locations)
-    if forced:  # before means are moved, which then are no more than what the simulator gives
-        new = linear(new, pushes) if first_order else with_forces(new, pushes)
+    known = set(before.names if before and first_order else ())
+    for forced, push in (
+        ([c for c in late if c.force and c.strength in known], with_forces),
+        ([c for c in late if c.force and c.strength not in known],
+         linear if first_order else with_forces),
+    ):  # fmt: skip
+        if forced:  # before means are moved, which then are no more than what the simulator gives
+            new = push(new, _pushes(forced, equations, names, locations))
+            equations = Equations(new, equations)
     new = _moved(new, [c for c in late if not c.force], equations, names, locations)
     parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:

@@ -352,8 +352,8 @@ def parts_of(roots: Iterable[Expr], parameter: Expr, own: Callable[[str], bool])
 # -- imports
 @dataclass(frozen=True)
 class Import:
-    """One primitive or distribution. same : equal for what is the same thing. path : its qualified
-    name in its module."""
+    """One primitive, simulator or distribution. same : equal for what is the same thing. path : its
+    qualified name in its module. thing : it itself, where no module has it under a name."""
 
     kind: str
     name: str
@@ -361,6 +361,7 @@ class Import:
     location: Location
     module: str
     path: str
+    thing: object = None
 
     @classmethod
     def of_primitive(cls, p: Primitive) -> Import:
@@ -371,8 +372,9 @@ class Import:
     @classmethod
     def of_simulator(cls, s: Simulator) -> Import:
         """The import that a call of it needs: by the name under which a module has it."""
-        module, name = holding(s)
-        return cls("simulator", name, id(s), s.location or Location("", 0), module, name)
+        (module, name), at = holding(s), s.location or Location("", 0)
+        thing = None if getattr(sys.modules.get(module), name, None) is s else s
+        return cls("simulator", name, id(s), at, module, name, thing)
 
     @classmethod
     def of_law(cls, o: Origin) -> Import:
@@ -390,13 +392,16 @@ def _called(call: Expr) -> str:
 
 
 def holding(simulator: Simulator) -> tuple[str, str]:
-    """(module, name) under which a module has a simulator; its own name where none has."""
+    """(module, name) under which a module has a simulator; where none has, as one made inside of a
+    function, its own name and the module in whose file it was made."""
     home = getattr(simulator.step, "__module__", "__main__")
     for name in (home, "__main__", *list(sys.modules)):
         for key, value in list(getattr(sys.modules.get(name), "__dict__", {}).items()):
             if value is simulator:
                 return name, key
-    return home, simulator.name
+    file = simulator.location.file if simulator.location else ""
+    made = (n for n, m in list(sys.modules.items()) if getattr(m, "__file__", None) == file)
+    return next(made, "__main__"), simulator.name
 
 
 def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> dict[str, Import]:
@@ -460,6 +465,11 @@ def import_lines(found: Iterable[Import], before: list[str]) -> list[str]:
     lines, own, folders = before, [], []
     for wanted in found:
         module, folder = _home(wanted)
+        if wanted.thing is not None:
+            place = wanted.location.place
+            own.append(
+                f"# {wanted.name}, made in {place}, needs a name at the top level of that file"
+            )
         if all(part.isidentifier() and not iskeyword(part) for part in module.split(".")):
             own.append(f"from {module} import {wanted.name}")
         else:  # dc-motor.py
@@ -475,6 +485,8 @@ def import_lines(found: Iterable[Import], before: list[str]) -> list[str]:
 
 def in_memory(i: Import) -> object | None:
     """The thing itself, where its module is there and has it under its name."""
+    if i.thing is not None:
+        return i.thing
     held = getattr(sys.modules.get(i.module), i.name, None) if i.path == i.name else None
     return held if getattr(held, "location", None) == i.location else None
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ssmppl.inference.optimisation.batched_newton import summed
 from ssmppl.inference.preparation.space import Space
 
 POINTS, SPREAD, CLIMBS = 45, 1.5, 3  # round a start, where many points are looked at together
@@ -27,19 +28,23 @@ def density_of(
 
 
 def densities_of(
-    space: Space, log_likelihoods: Callable[[np.ndarray], np.ndarray]
+    space: Space, increments: Callable[[np.ndarray], np.ndarray]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """As `density_of`, of many points z (B, F) at once."""
+    """As `density_of`, of many points z (B, F) at once: (B, R + 1) the R increments of the
+    log-likelihood, and the log prior density.
+
+    increments : (B, P) parameter vectors -> (B, R).
+    """
 
     def values(z: np.ndarray) -> np.ndarray:
-        out = np.full(len(z), -np.inf)
         found = [space.point(row) for row in z]
         inside = [k for k, (_, *logs) in enumerate(found) if sum(logs) > -np.inf]
-        if inside:
-            theta = np.array([found[k][0] for k in inside])
-            prior = np.array([found[k][1] for k in inside])
-            out[inside] = log_likelihoods(theta) + prior
-        return np.where(np.isfinite(out), out, -np.inf)
+        if not inside:
+            return np.full((len(z), 1), -np.inf)
+        rows = increments(np.array([found[k][0] for k in inside]))
+        out = np.full((len(z), rows.shape[1] + 1), -np.inf)
+        out[inside] = np.column_stack([rows, [found[k][1] for k in inside]])
+        return out
 
     return values
 
@@ -52,4 +57,4 @@ def best_of_many(
     rng = np.random.default_rng(seed)
     z = points[0]
     every = np.vstack([*points, z + SPREAD * rng.standard_normal((POINTS, len(z)))])
-    return every[np.argsort(-densities(every))[:CLIMBS]]
+    return every[np.argsort(-summed(densities(every)))[:CLIMBS]]

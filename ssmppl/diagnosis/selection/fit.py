@@ -42,7 +42,7 @@ from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.optimisation.batched_newton import climb_together
+from ssmppl.inference.optimisation.batched_newton import climb_together, summed
 from ssmppl.inference.optimisation.batched_newton import information_at as information_of_many
 from ssmppl.inference.optimisation.newton import (
     GOOD,
@@ -274,7 +274,7 @@ class Fitter:
         smooth = self._extended_log_likelihood(problem)
         many = self._extended_of_many(problem)
         if smooth is not None and many is not None:
-            return self._fit_together(space, smooth, many, seed, effort, information)
+            return self._fit_together(space, smooth, many, seed, effort)
         if effort.pilot:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
@@ -346,8 +346,9 @@ class Fitter:
         return value
 
     def _extended_of_many(self, problem: Problem) -> Callable[[np.ndarray], np.ndarray] | None:
-        """(B, P) parameter vectors -> (B,) log p(y | theta) by the extended Kalman filter, where
-        the model calls a simulator, so that many at once take little longer than one; else None."""
+        """(B, P) parameter vectors -> (B, R), the increments of log p(y | theta) by the extended
+        Kalman filter, where the model calls a simulator, so that many at once take little longer
+        than one; else None."""
         found = extended_model(problem.trace)
         if isinstance(found, NotApplicable) or self.settings.proposal != "twisted":
             return None
@@ -355,14 +356,15 @@ class Fitter:
 
         def values(theta: np.ndarray) -> np.ndarray:
             with thriftily():  # climbs look at differences that are far larger than its error
-                return found.log_likelihoods(problem.experiments, theta) + shift
+                rows = found.increments(problem.experiments, theta)
+            rows[:, 0] += shift
+            return rows
 
         return values
 
     def _fit_together(
         self, space: Space, smooth: Callable[[np.ndarray], float],
         many: Callable[[np.ndarray], np.ndarray], seed: np.random.SeedSequence, effort: Effort,
-        information: np.ndarray | None,
     ) -> Fit:  # fmt: skip
         """The top of the extended filter's likelihood, whose points are looked at together; from a
         start near it to within what a decision needs."""
@@ -372,7 +374,7 @@ class Fitter:
         if effort.pilot:
             begun = [self._with_process_noise(space, share) for share in NOISE_SHARES[1:]]
             starts = best_of_many(densities, [z, *(s.z[s.positions] for s in begun)], seed)
-        found = climb_together(densities, starts, effort.pilot, information)
+        found = climb_together(densities, starts, effort.pilot)
         if found is None:
             raise ArgumentError(
                 "the extended Kalman filter is not finite (NaN or infinite) at every point tried",
@@ -747,7 +749,7 @@ def flat_outwards(function: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -
     """(F,) bool: which may have run to a bound, as the first step outwards costs nothing; by the
     function (B, F) -> (B,) of many points at once."""
     steps = OUTWARDS[0] * np.eye(len(z))
-    here, *away = function(np.vstack([z[None], z + steps, z - steps]))
+    here, *away = summed(function(np.vstack([z[None], z + steps, z - steps])))
     found: np.ndarray = np.any(np.reshape(away, (2, -1)) >= here - FREE, axis=0)
     return found
 

@@ -53,6 +53,11 @@ class Extended(Scored):
         data = tuple(experiments)
         return self._filter(data).log_likelihoods(data, theta)
 
+    def increments(self, experiments: Iterable[Experiment], theta: np.ndarray) -> np.ndarray:
+        """(B, R) likewise, of each of the rows of all experiments, whose sum that is."""
+        data = tuple(experiments)
+        return self._filter(data).increments(data, theta)
+
     def trajectories(
         self, experiment: Experiment, theta: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:

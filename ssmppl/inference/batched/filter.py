@@ -61,8 +61,18 @@ class BatchedFilter:
 
         record : takes the moments of each row; of a single data set.
         """
+        increments = self.increments(experiments, theta, record)
+        total: np.ndarray = increments.sum(axis=1)
+        return total
+
+    def increments(
+        self, experiments: Sequence[Experiment], theta: np.ndarray,
+        record: list[Moments] | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """(B, R) likewise, of each of the R rows of all data sets; -inf in all of them where a
+        point has no number."""
         lanes = _Lanes(self.trace, experiments, np.asarray(theta, dtype=float))
-        total = np.zeros(lanes.count)
+        out = np.zeros((lanes.count, lanes.steps))
         dead = np.zeros(lanes.count, dtype=bool)
         x = covariance = np.empty(0)
         with np.errstate(all="ignore"):
@@ -84,15 +94,15 @@ class BatchedFilter:
                     dead |= ~(fine.all(axis=1) & np.isfinite(increment)) & going
                     if dead.all():
                         break
-                total += increment if going is True else np.where(going, increment, 0.0)
+                out[:, t] = increment if going is True else np.where(going, increment, 0.0)
                 if record is not None:
                     record.append(Moments(x, covariance, rest, p, cross))
                 if dead.any():  # in place of what is no number
                     alive = int(np.argmin(dead))
                     x = np.where(dead[:, None], x[alive], x)
                     covariance = np.where(dead[:, None, None], covariance[alive], covariance)
-        total[dead] = -np.inf
-        return lanes.summed(total)
+        out[dead] = -np.inf
+        return lanes.of_vectors(out)
 
     def _started(self, lanes: _Lanes) -> tuple[np.ndarray, np.ndarray]:
         d = self.size
@@ -261,10 +271,10 @@ class _Lanes:
         values = [a[min(row, len(a) - 1), column] for a in self.arrays[base]]
         return values[0] if self.sets == 1 else np.repeat(values, self.vectors)
 
-    def summed(self, total: np.ndarray) -> np.ndarray:
-        """(B,) over the data sets."""
-        whole: np.ndarray = total.reshape(self.sets, self.vectors).sum(axis=0)
-        return whole
+    def of_vectors(self, rows: np.ndarray) -> np.ndarray:
+        """(B, R) of lanes (L, T): the rows of all data sets, one after the other."""
+        sets = rows.reshape(self.sets, self.vectors, -1)
+        return np.concatenate(sets, axis=1)
 
 
 def _step(

@@ -34,7 +34,7 @@ from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximizati
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.optimisation.batched_newton import climb_together
+from ssmppl.inference.optimisation.batched_newton import climb_together, summed
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
 from ssmppl.inference.preparation.exact_models import ExactModel, likelihood_by
 from ssmppl.inference.preparation.space import free_components
@@ -457,7 +457,7 @@ class BatchedClimb:
         """The climb. Ctrl-C ends it early, with the best so far."""
         setup = self.setup
         try:
-            found = climb_together(self.objectives, self._starts())
+            found = climb_together(self.parts, self._starts())
         except KeyboardInterrupt:
             if not len(self.best):
                 raise
@@ -505,18 +505,25 @@ class BatchedClimb:
 
     def objectives(self, z: np.ndarray) -> np.ndarray:
         """(B,) the log-likelihood at z (B, F), with the prior where it counts; -inf for none."""
+        return summed(self.parts(z))
+
+    def parts(self, z: np.ndarray) -> np.ndarray:
+        """(B, R + 1) of the same sums the R increments of the log-likelihood, and the log prior
+        density or 0."""
         self.evaluations += len(z)
-        out = np.full(len(z), -np.inf)
         found = [self.setup.space.point(row) for row in z]
         inside = [k for k, (_, log_prior, _) in enumerate(found) if log_prior > -np.inf]
-        if inside:
-            theta = np.array([found[k][0] for k in inside])
-            out[inside] = self.model.log_likelihoods(self.setup.problem.experiments, theta)
-        if self.setup.with_prior:
-            out[inside] += [found[k][1] for k in inside]
-        k = int(np.argmax(out))
-        if out[k] > self.best_value:
-            self.best, self.best_value = z[k].copy(), float(out[k])
+        if not inside:
+            return np.full((len(z), 1), -np.inf)
+        theta = np.array([found[k][0] for k in inside])
+        rows = self.model.increments(self.setup.problem.experiments, theta)
+        prior = [found[k][1] if self.setup.with_prior else 0.0 for k in inside]
+        out = np.full((len(z), rows.shape[1] + 1), -np.inf)
+        out[inside] = np.column_stack([rows, prior])
+        total = summed(out)
+        k = int(np.argmax(total))
+        if total[k] > self.best_value:
+            self.best, self.best_value = z[k].copy(), float(total[k])
         return out
 
     def objective(self, z: np.ndarray) -> float:

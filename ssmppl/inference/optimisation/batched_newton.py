@@ -1,13 +1,14 @@
 """Newton's ascent of a function that takes many points at once, where many cost little more than
 one.
 
-Value, gradient and second derivatives are differences over one set of points, and the shares of a
-step are tried together with the differences at its whole, so that a step that climbs costs one
-call. Second derivatives take many points: they are taken where a climb starts and they are not
-given, where a step led nowhere, and at the top; between these the slopes update them
-(`newton.bfgs_update`). Several climbs
-go on side by side in the same calls. Where the function is not concave, eigenvalues count by their
-size (`newton.newton_step`).
+Value and gradient are differences over one set of points, and the shares of a step are tried
+together with the differences at its whole, so that a step that climbs costs one call. Second
+derivatives take many points. Of a log-likelihood whose increments are known row by row the climb
+begins with the outer products of their slopes (Berndt, Hall, Hall and Hausman, *Annals of Economic
+and Social Measurement* 3, 1974), which cost nothing more; of another function with differences.
+Differences are taken where a step led nowhere, and at the top; between these the slopes update what
+there is (`newton.bfgs_update`). Several climbs go on side by side in the same calls. Where the
+function is not concave, eigenvalues count by their size (`newton.newton_step`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ import numpy as np
 
 from ssmppl.inference.optimisation.newton import Top, bfgs_update, newton_step
 
-Function = Callable[[np.ndarray], np.ndarray]  # (B, F) -> (B,), -inf where there is no value
+# (B, F) -> (B,), -inf where there is no value; or (B, R), the parts of a sum, of which the last has
+# no law that its slopes' outer products would tell of (a log prior).
+Function = Callable[[np.ndarray], np.ndarray]
 
 STEPS = 60
 FIRST, SHORTEST, LONGEST = 0.02, 1e-4, 0.1  # steps of differences in z
@@ -37,7 +40,7 @@ SLOPES, CURVATURES, FINE = 1, 2, 3  # what a stencil tells
 @dataclass(eq=False)
 class Climber:
     """One of the climbs. size : (F,) of its differences. path : where it has been. stale : whether
-    second derivatives are to be taken anew."""
+    second derivatives are to be taken anew; by_parts : whether outer products will do for that."""
 
     z: np.ndarray
     value: float
@@ -49,44 +52,39 @@ class Climber:
     ended: bool = False
     path: list[np.ndarray] = field(default_factory=list)
     stale: bool = True
+    by_parts: bool = False
 
     @property
     def tells(self) -> int:
         """What its next stencil has to tell."""
         if self.distance < FINAL:
             return FINE
-        return CURVATURES if self.stale else SLOPES
+        return CURVATURES if self.stale and not self.by_parts else SLOPES
 
     @property
     def top(self) -> Top:
         return Top(self.z, self.value, self.information, self.distance)
 
 
-def climb_together(
-    function: Function, starts: np.ndarray, precise: bool = True,
-    information: np.ndarray | None = None,
-) -> Climber | None:  # fmt: skip
+def climb_together(function: Function, starts: np.ndarray, precise: bool = True) -> Climber | None:
     """The highest of the climbs from starts (K, F); None where none has a value.
 
     precise : to the very top, with the second derivatives there; else to within `NEAR`, with what
         the climb has made of them.
-    information : (F, F) minus the second derivatives, about, where it starts; None: by differences.
 
     Ctrl-C is left to the caller, who sees every point that the function is asked for.
     """
     starts = np.atleast_2d(starts)
-    values = function(starts)
+    found = function(starts)
     climbers = [
-        Climber(z.copy(), float(v), np.full(len(z), FIRST), path=[z.copy()])
-        for z, v in zip(starts, values, strict=True)
+        Climber(
+            z.copy(), float(v), np.full(len(z), FIRST), path=[z.copy()], by_parts=found.ndim > 1
+        )
+        for z, v in zip(starts, summed(found), strict=True)
         if np.isfinite(v)
     ]
     if not climbers:
         return None
-    if information is not None:
-        for c in climbers:
-            c.information, c.stale = information.copy(), False
-            c.size = _sizes(information)
     _differentiate(function, dict.fromkeys(climbers))
     further = LATE
     for _ in range(STEPS):
@@ -117,15 +115,15 @@ def _step(function: Function, climbers: list[Climber]) -> None:
     found = np.split(function(np.array(points)), np.cumsum(counts)[:-1])
     later: dict[Climber, np.ndarray | None] = {}
     for c, move, values in zip(climbers, moves, found, strict=True):
-        shares, stencil = values[: len(SHARES) - 1], values[len(SHARES) - 1 :]
-        tried = np.concatenate([stencil[:1], shares])
+        stencil = values[len(SHARES) - 1 :]
+        tried = summed(np.concatenate([stencil[:1], values[: len(SHARES) - 1]]))
         k = int(np.argmax(np.where(np.isfinite(tried), tried, -np.inf)))
         if not tried[k] > c.value:
             # a gain below the rounding of the function: the step is as right as can be told
             c.ended = c.distance < FINAL or c.reach < SHORTEST
             c.reach *= 0.1
-            if not c.ended and not c.stale:
-                c.stale = True
+            if not c.ended and (c.by_parts or not c.stale):
+                c.stale, c.by_parts = True, False
                 later[c] = None
             continue
         c.z, c.value = c.z + SHARES[k] * move, float(tried[k])
@@ -134,7 +132,7 @@ def _step(function: Function, climbers: list[Climber]) -> None:
         if k == 0:
             _take(c, stencil, c.tells, move)
         else:
-            c.stale = c.stale or SHARES[k] < MUCH
+            c.stale, c.by_parts = c.stale or SHARES[k] < MUCH, values.ndim > 1
             later[c] = None if c.stale else SHARES[k] * move
     if later:
         _differentiate(function, later)
@@ -172,12 +170,15 @@ def _moved(z: np.ndarray, by: dict[int, float]) -> np.ndarray:
 
 def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = None) -> None:
     """Slope, curvature and the next steps from the values at a stencil, that `move` led to."""
+    values, parts = summed(values), values if values.ndim > 1 else None
     if tells == SLOPES:
         up, down = np.split(values[1:], 2)
         slope = _slopes(values[0], up, down, c.size)
         curvature = -c.information
         if move is not None:
             curvature = -_updated(c.information, move, c.slope - slope)
+        elif parts is not None:
+            curvature = -_outer_products(parts, c.size)
         c.stale = not np.all(np.isfinite(slope))
     else:
         slope, curvature = derivatives(values, c.size)
@@ -205,7 +206,7 @@ def information_at(function: Function, z: np.ndarray, about: np.ndarray) -> np.n
     about : (F, F) what they are, roughly, for the steps of the differences.
     """
     size = _sizes(about)
-    return -derivatives(function(np.array(_stencil(z, size, FINE))), size)[1]
+    return -derivatives(summed(function(np.array(_stencil(z, size, FINE)))), size)[1]
 
 
 def _slopes(middle: float, up: np.ndarray, down: np.ndarray, h: np.ndarray) -> np.ndarray:
@@ -214,6 +215,29 @@ def _slopes(middle: float, up: np.ndarray, down: np.ndarray, h: np.ndarray) -> n
         one_sided = np.where(np.isfinite(up), up - middle, middle - down) / h
         both = (up - down) / (2.0 * h)
     return np.where(np.isfinite(both), both, one_sided)
+
+
+def summed(values: np.ndarray) -> np.ndarray:
+    """(B,) of values, or of the parts (B, R) of sums; -inf where a part is none."""
+    if values.ndim == 1:
+        return values
+    total: np.ndarray = values.sum(axis=1)
+    return np.where(np.isfinite(total), total, -np.inf)
+
+
+def _outer_products(parts: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """(F, F) the sum over parts of the products of their slopes, from those (1 + 2 F, R) at a point
+    and at both sides of it; of the last part its second differences instead, one by one."""
+    n = len(h)
+    middle, up, down = parts[0], parts[1 : n + 1], parts[n + 1 :]
+    with np.errstate(invalid="ignore"):
+        slopes = (up - down) / (2.0 * h)[:, None]
+        one_sided = np.where(np.isfinite(up), up - middle, middle - down) / h[:, None]
+        slopes = np.where(np.isfinite(slopes), slopes, one_sided)[:, :-1]
+        bent = (2.0 * middle - up - down)[:, -1] / h**2
+    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+    found: np.ndarray = slopes @ slopes.T
+    return found + np.diag(np.where(bent > 0.0, bent, 0.0))
 
 
 def _updated(information: np.ndarray, move: np.ndarray, fall: np.ndarray) -> np.ndarray:

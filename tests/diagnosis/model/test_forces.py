@@ -11,9 +11,9 @@ from ssmppl.diagnosis.model.equations import Equations
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.diagnosis.report.engine_attributes import attribute_of
-from ssmppl.diagnosis.report.model_file import model_text
+from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import symbols_of
+from ssmppl.expressions.expr import symbols_of, topological
 from ssmppl.language.tracing import trace
 
 T = 40
@@ -146,6 +146,41 @@ def test_several_effects_on_one_force_add_up():
         added = augment(traced, both, first_order=first_order)
         inside = {s.data[1] for s in symbols_of([added.transition["v1"].distribution.mean()[()]])}
         assert {c.strength for c in both} <= inside
+
+
+@pytest.mark.parametrize("torque_noise", [False, True])
+def test_the_score_of_a_further_effect_is_taken_where_the_first_one_acts(torque_noise):
+    """That one stays inside of the step, at its own strength: only what is new is linear."""
+    traced, found = offered(model_of(torque_noise=torque_noise), ["quadratic drag", "gravity"])
+    drag_, gravity = (
+        next(c for c in found if c.equation == "v2" and c.effect.name == n)
+        for n in ("quadratic drag", "gravity")
+    )
+    first = augment(traced, [drag_])
+    both = augment(first, [gravity], first_order=True)
+    columns = score_columns(first, both, [gravity.strength], [], Missing(none=True))
+    followed = [e for _, e in columns.follows["transition"]]
+    calls = [n for n in topological([*columns.later, *followed]) if n.op == "simulator"]
+    assert calls
+    for call in calls:
+        assert drag_.strength in {s.data[1] for s in symbols_of([call.args[7]])}  # f2
+
+
+def test_the_model_with_an_effect_is_there_where_no_module_has_the_simulator():
+    """As one made inside of a function; its file says which name is wanted."""
+
+    def made():
+        return ssm.simulator(**NAMES, forces={"f1": "v1", "f2": "v2"}, name="local")(step)
+
+    traced, candidate = drag(model_of(made()))
+    added = augment(traced, [candidate])
+    again = to_model(added)
+    at = {"d": 0.3, "s": 0.1, candidate.strength: 0.8}
+    inputs = {n: np.zeros(5) for n in ("u1", "u2")}
+    assert np.isfinite(ssm.simulate(again, at, steps=5, inputs=inputs, seed=1)["v2"]).all()
+    text = model_text(added, added=[candidate])
+    assert "# local, made in test_forces.py:" in text
+    assert "import local" in text
 
 
 def test_the_file_of_the_augmented_model_calls_the_simulator_with_the_force():

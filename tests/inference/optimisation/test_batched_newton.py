@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from ssmppl.inference.optimisation.batched_newton import NEAR, climb_together, information_at
+from ssmppl.inference.optimisation.batched_newton import (
+    NEAR,
+    climb_together,
+    information_at,
+    summed,
+)
 from ssmppl.inference.optimisation.newton import bfgs_update
 
 H = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, -0.3], [0.2, -0.3, 0.7]])
@@ -51,19 +56,61 @@ def test_the_curvature_that_slopes_build_up_is_near_the_true_one():
     assert min(asked[2:]) < newton
 
 
-@pytest.mark.parametrize("about", [H, 4.0 * H, np.diag([20.0, 0.3, 0.7])])
-def test_a_curvature_that_is_given_takes_no_points(about):
-    """Also a wrong one, whose climb gets there as well."""
+def regression(rows=400):
+    """Increments of the log-likelihood of a Poisson regression, and its prior: minus the second
+    derivatives are X' diag(mean) X + 1 / 4, and the outer products of slopes are about that."""
+    rng = np.random.default_rng(7)
+    x = np.column_stack([np.ones(rows), rng.normal(size=(rows, 2))])
+    y = rng.poisson(np.exp(x @ TOP))
+
+    def parts(z):
+        eta = z @ x.T
+        return np.column_stack([y * eta - np.exp(eta), -0.125 * np.sum(z**2, axis=1)])
+
+    def information(z):
+        return (x * np.exp(x @ z)[:, None]).T @ x + 0.25 * np.eye(3)
+
+    def spread(z):  # sd of a sum of products of two slopes
+        slopes = x * (y - np.exp(x @ z))[:, None]
+        products = slopes[:, :, None] * slopes[:, None, :]
+        return np.sqrt(rows) * products.std(axis=0)
+
+    return parts, information, spread
+
+
+@pytest.mark.parametrize("precise", [True, False])
+def test_increments_tell_of_second_derivatives_without_points_of_their_own(precise):
+    function, information, spread = regression()
     asked = []
 
     def counted(points):
         asked.append(len(points))
-        return quadratic(points)
+        return function(points)
 
-    found = climb_together(counted, np.zeros((1, 3)), False, about)
-    away = found.z - TOP
-    assert 0.5 * away @ H @ away < 10.0 * NEAR
-    assert asked[1] == 1 + 2 * 3  # slopes alone
+    found = climb_together(counted, np.zeros((1, 3)), precise)
+    slopes, shares = 1 + 2 * 3, 4
+    assert asked[:2] == [1, slopes]
+    if not precise:
+        assert set(asked[2:]) <= {slopes, slopes + shares}
+    exact = information(found.z)
+    top = climb_together(lambda z: summed(function(z)), np.zeros((1, 3)))
+    assert 0.5 * (found.z - top.z) @ exact @ (found.z - top.z) < (1e-6 if precise else 5 * NEAR)
+    error = 1e-4 * np.abs(exact) if precise else 4.0 * spread(found.z)
+    assert np.all(np.abs(found.information - exact) <= error)
+
+
+def test_a_part_without_a_value_is_none():
+    """A cliff beside the start: slopes on one side, and no step beyond it."""
+    function, *_ = regression()
+
+    def cut(z):
+        out = function(z)
+        out[z[:, 0] > 0.41] = -np.inf
+        return out
+
+    found = climb_together(cut, np.array([[0.409, 0.0, 0.0]]), precise=False)
+    assert found.z[0] <= 0.41
+    assert summed(function(found.z[None]))[0] > summed(function(np.array([[0.409, 0.0, 0.0]])))[0]
 
 
 def test_second_derivatives_at_a_point():
