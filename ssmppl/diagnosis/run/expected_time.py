@@ -12,7 +12,7 @@ from ssmppl.inference.run.executors import workers_of
 
 REFITS = 18  # of single effects, their shapes, pairs and the reference, about
 EVALUATIONS, FIT_PASSES = 4000, 60  # likelihoods and passes over the data in a fit, about
-TOGETHER = 800  # likelihoods in a fit where many are looked at in one call
+TOGETHER = 250  # likelihoods in a fit where many are looked at in one call
 APPROXIMATE = 800  # likelihoods in an approximate fit
 SCREENS = 1.0  # as long as the first one that follow it: for further effects, under other inputs
 TEXT = 0.5  # of the time that the screen's code took, which a fit's takes, one at a time
