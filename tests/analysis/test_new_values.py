@@ -357,7 +357,7 @@ def test_flows_drawn_first_have_the_posterior_of_the_lagged_form():
     data = read_csv(EXAMPLES / "seir" / "data.csv")[["reported"]]
     drawn = [
         ssm.sample(
-            model, data, ssm.PMMH(particles=150), draws=4000, warmup=1000, chains=4,
+            model, data, ssm.PMMH(particles=150), draws=1000, warmup=500, chains=4,
             seed=seed_of("seir", k), progress=False, states=False,
         )["posterior"]
         for k, model in enumerate((load_model(str(EXAMPLES / "seir" / "model.py")), lagged_seir()))
