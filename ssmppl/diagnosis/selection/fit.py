@@ -366,15 +366,15 @@ class Fitter:
         self, space: Space, smooth: Callable[[np.ndarray], float],
         many: Callable[[np.ndarray], np.ndarray], seed: np.random.SeedSequence, effort: Effort,
     ) -> Fit:  # fmt: skip
-        """The top of the extended filter's likelihood, whose points are looked at together; from a
-        start near it to within what a decision needs."""
+        """The top of the extended filter's likelihood, whose points are looked at together, to
+        within what a decision needs."""
         z = space.z[space.positions]
         densities = densities_of(space, many)
         starts = z[None]
         if effort.pilot:
             begun = [self._with_process_noise(space, share) for share in NOISE_SHARES[1:]]
             starts = best_of_many(densities, [z, *(s.z[s.positions] for s in begun)], seed)
-        found = climb_together(densities, starts, effort.pilot)
+        found = climb_together(densities, starts, precise=False)
         if found is None:
             raise ArgumentError(
                 "the extended Kalman filter is not finite (NaN or infinite) at every point tried",
@@ -382,6 +382,9 @@ class Fitter:
                 "simulator gives NaN",
             )
         top = found.top
+        if effort.pilot:
+            exact = information_of_many(densities, top.z, top.information)
+            top = replace(top, information=exact) if np.isfinite(exact).all() else top
         there = at(space, space.parameters(top.z)[0].copy())
         fit = self._better_of(None, there, top, seed)
         if effort.approximate:

@@ -29,18 +29,22 @@ FIRST, SHORTEST, LONGEST = 0.02, 1e-4, 0.1  # steps of differences in z
 WIDTH = 0.05  # of the steps of differences, in standard deviations by the last curvature
 FARTHEST = 2.0  # of a step in any coordinate, in units of it where it is larger than one
 LATE = 3  # steps of the others once the highest is at its end
+EARLY, HOPEFUL = 3, 3.0  # steps after which those wait that cannot reach the highest one, even if
+# they had so many times as far to go as their quadratics say
 SHARES = (1.0, 0.5, 0.15, 0.03, 1e-3)  # of a step that are tried
 MUCH = 0.4  # of a step: where less of it is best, its second derivatives were wrong
 GOOD = 1e-7  # that the quadratic still expects to gain, where a climb is at its end
 FINAL = 1e-3  # from where on differences are extrapolated to zero step
 NEAR = 1e-2  # likewise, where a climb that need not be precise is at its end
+LEAST_SCALE = 1e-3  # of outer products
 SLOPES, CURVATURES, FINE = 1, 2, 3  # what a stencil tells
 
 
 @dataclass(eq=False)
 class Climber:
     """One of the climbs. size : (F,) of its differences. path : where it has been. stale : whether
-    second derivatives are to be taken anew; by_parts : whether outer products will do for that."""
+    second derivatives are to be taken anew; by_parts : whether outer products will do for that;
+    rough : whether those are all there is."""
 
     z: np.ndarray
     value: float
@@ -53,6 +57,7 @@ class Climber:
     path: list[np.ndarray] = field(default_factory=list)
     stale: bool = True
     by_parts: bool = False
+    rough: bool = False
 
     @property
     def tells(self) -> int:
@@ -87,12 +92,14 @@ def climb_together(function: Function, starts: np.ndarray, precise: bool = True)
         return None
     _differentiate(function, dict.fromkeys(climbers))
     further = LATE
-    for _ in range(STEPS):
+    for step in range(STEPS):
         going = [c for c in climbers if not c.ended]
         best = max(climbers, key=lambda c: c.value)
         if best.ended:
             going = [c for c in going if c.value + c.distance > best.value]
             further -= 1
+        elif step >= EARLY:
+            going = [c for c in going if c.value + HOPEFUL * c.distance > best.value]
         if not (going and further):
             break
         _step(function, going)
@@ -176,9 +183,10 @@ def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = 
         slope = _slopes(values[0], up, down, c.size)
         curvature = -c.information
         if move is not None:
-            curvature = -_updated(c.information, move, c.slope - slope)
+            curvature = -_updated(c.information, move, c.slope - slope, c.rough)
+            c.rough = False
         elif parts is not None:
-            curvature = -_outer_products(parts, c.size)
+            curvature, c.rough = -_outer_products(parts, c.size), True
         c.stale = not np.all(np.isfinite(slope))
     else:
         slope, curvature = derivatives(values, c.size)
@@ -240,15 +248,22 @@ def _outer_products(parts: np.ndarray, h: np.ndarray) -> np.ndarray:
     return found + np.diag(np.where(bent > 0.0, bent, 0.0))
 
 
-def _updated(information: np.ndarray, move: np.ndarray, fall: np.ndarray) -> np.ndarray:
+def _updated(
+    information: np.ndarray, move: np.ndarray, fall: np.ndarray, rough: bool
+) -> np.ndarray:
     """A positive definite (F, F) for which `fall` of the slopes (F,) is about that along `move`;
-    by the sizes of the eigenvalues of the last, as steps are."""
+    by the sizes of the eigenvalues of the last, as steps are. rough : outer products, far from the
+    top, can be many times too large, and are first brought down as a whole to what is seen along
+    the step (S. Oren and D. Luenberger, *Management Science* 20, 1974)."""
     values, vectors = np.linalg.eigh(information)
     least = 1e-8 * float(np.max(np.abs(values), initial=1e-300))
     h = (vectors * np.maximum(np.abs(values), least)) @ vectors.T
     if not move @ h @ move > 0.0:
         return h
-    return bfgs_update(h, move, np.where(np.isfinite(fall), fall, 0.0))
+    fall = np.where(np.isfinite(fall), fall, 0.0)
+    if rough:
+        h = h * np.clip(fall @ move / (move @ h @ move), LEAST_SCALE, 1.0)
+    return bfgs_update(h, move, fall)
 
 
 def derivatives(values: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
