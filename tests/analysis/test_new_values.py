@@ -213,7 +213,9 @@ def test_paths_of_counts(method):
             assert abs(means[:, t].mean() - exact[t, i]) < 5.4 * error, (name, t)  # t, 7 d.o.f.
 
 
-@pytest.mark.parametrize("proposal", ["bootstrap", "marginal"])
+@pytest.mark.parametrize(
+    "proposal", ["bootstrap", pytest.param("marginal", marks=pytest.mark.slow)]
+)
 def test_paths_of_regimes(proposal):
     """Backward simulation, with z and x integrated out too, where their law reads the regime that
     the step leads to."""

@@ -23,7 +23,7 @@ def test_every_operation_has_a_meaning_and_is_tested():
     assert set(MEANING) == set(TABLE) | OTHERS
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(programs(), some.integers(0, 2**32 - 1))
 def test_random_graphs(program, seed):
     rng = np.random.default_rng(seed)

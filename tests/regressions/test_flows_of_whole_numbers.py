@@ -58,7 +58,7 @@ def passes(g):
     return np.log(total), np.array(forward) * back / total
 
 
-@pytest.mark.parametrize("kernel", ["exact", "mcmc"])
+@pytest.mark.parametrize("kernel", [pytest.param("exact", marks=pytest.mark.slow), "mcmc"])
 def test_smoothed_means_are_those_of_the_sums(kernel):
     exact = passes(AT["g"])[1] @ np.array([r for _, r in STATES])
     method = ssm.FFBSi(kernel=kernel, proposal="bootstrap", moves=20)
@@ -70,6 +70,7 @@ def test_smoothed_means_are_those_of_the_sums(kernel):
     assert np.all(abs(np.mean(means, axis=0) - exact) <= 4.5 * error + 2e-3)  # bias of 1 / N
 
 
+@pytest.mark.slow
 def test_the_score_is_the_slope_of_the_sums():
     step = 1e-4
     exact = (passes(AT["g"] + step)[0] - passes(AT["g"] - step)[0]) / (2 * step)

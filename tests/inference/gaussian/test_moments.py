@@ -184,7 +184,7 @@ def test_what_is_asked_for_wrongly_is_said():
     walk.observation(lambda n: {"y": ssm.Normal(n, sd=1)})
     data = {"y": np.arange(4.0)}
     for kind in KINDS:
-        with pytest.raises(ArgumentError, match="Poisson, not one of a Gaussian noise"):
+        with pytest.raises(ArgumentError, match="Poisson, not driven by Gaussian noise"):
             ssm.smooth(walk, data, {}, proposal=kind)
     with pytest.raises(ArgumentError, match="beside method"):
         ssm.smooth(bent(), BENT, {"d": 1.0}, "ffbsi", proposal="laplace")

@@ -172,7 +172,7 @@ def test_where_it_cannot_be_corrected_the_next_method_takes_over(monkeypatch):
     assert "twisted particle filters of" in found.attrs["method_chosen"]
     assert "continuous in the parameters" in found.attrs["likelihood"]
     asked = ssm.maximize(model, {"y": y[:15]}, ssm.DirectOptimization(), seed=1, progress=False)
-    assert asked.attrs["likelihood"].startswith("Laplace's approximation, not corrected: twisted")
+    assert asked.attrs["likelihood"].startswith("Laplace's approximation, not corrected: the sd")
     assert asked.attrs["approximate"]
 
 

@@ -221,9 +221,8 @@ def test_the_iterates_of_every_start():
     assert again.parameters == found.parameters
 
 
-@pytest.mark.parametrize(
-    "objective", [pytest.param("likelihood", marks=pytest.mark.slow), "posterior"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("objective", ["likelihood", "posterior"])
 def test_several_experiments(objective):
     """Three free parameters, an input, missing rows, two experiments."""
     data = [simulated(40, "first"), simulated(25, "second")]
@@ -254,9 +253,10 @@ def ricker(growth):
     return model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("growth", [
     pytest.param(lambda n, r, e: n * np.exp(r - n + e), id="formula"),
-    pytest.param(grow, id="primitive", marks=pytest.mark.slow),
+    pytest.param(grow, id="primitive"),
 ])  # fmt: skip
 def test_counts_of_a_deterministic_state(growth):
     truth = {"r": 3.6, "sd": 0.3, "scale": 10.0, "n0": 7.0}

@@ -39,7 +39,9 @@ def started(setup, theta, settings, *seed):
     return begun.paths, begun.stream
 
 
-@pytest.mark.parametrize("proposal", ["bootstrap", "auxiliary"])
+@pytest.mark.parametrize(
+    "proposal", [pytest.param("bootstrap", marks=pytest.mark.slow), "auxiliary"]
+)
 @pytest.mark.parametrize("name", ["lgss", "companion"])
 def test_mean_over_all_paths_has_the_expectation_of_the_drawn_one(name, proposal):
     """At a fixed theta, sweep by sweep, against the exact smoother; five particles.

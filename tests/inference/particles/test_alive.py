@@ -166,7 +166,8 @@ def test_the_estimate_has_the_law_that_enumeration_gives_it_and_no_bias(n, rescu
     assert stats.chisquare(o, e).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("rescue", [pytest.param(5, marks=SLOW), 200])
+@pytest.mark.slow
+@pytest.mark.parametrize("rescue", [5, 200])
 def test_unbiased_where_the_plain_filter_dies(rescue):
     y = data_of()
     data = [{"y": y}, {"y": data_of(5, 8)}]
