@@ -30,7 +30,7 @@ from ssmppl.diagnosis.model.changed_laws import (
     substituted,
 )
 from ssmppl.diagnosis.model.equations import Augmented, Equations, Part, as_it_was
-from ssmppl.diagnosis.model.forces import Force, linear, with_forces
+from ssmppl.diagnosis.model.forces import Force, linear, pushed, with_forces
 from ssmppl.errors import ArgumentError, Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed
@@ -77,15 +77,16 @@ def augment(
     equations = Equations(new, equations)
     for c in late:
         names[c.strength] = auxiliary.add(c, equations, locations)
-    known = set(before.names if before and first_order else ())
-    for forced, push in (
-        ([c for c in late if c.force and c.strength in known], with_forces),
-        ([c for c in late if c.force and c.strength not in known],
-         linear if first_order else with_forces),
-    ):  # fmt: skip
-        if forced:  # before means are moved, which then are no more than what the simulator gives
-            new = push(new, _pushes(forced, equations, names, locations))
-            equations = Equations(new, equations)
+    forced = [c for c in late if c.force]
+    pushes = _pushes(forced, equations, names, locations)
+    inside, rest = pushes, []
+    if first_order:  # what is in the model already acts as it does there
+        known = before.names if before else {}
+        inside = [p for c, p in zip(forced, pushes, strict=True) if c.strength in known]
+        rest = [(pushed(f, inside), by) for c, (f, by) in zip(forced, pushes, strict=True)
+                if c.strength not in known]  # fmt: skip
+    # Before means are moved, which then are no more than what the simulator gives.
+    new = linear(with_forces(new, inside), rest) if forced else new
     new = _moved(new, [c for c in late if not c.force], equations, names, locations)
     parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:

@@ -70,14 +70,25 @@ def _is_given(e: Expr) -> bool:
 
 def with_forces(trace: Trace, pushes: list[tuple[Force, Expr]]) -> Trace:
     """The trace with increments of forces."""
+    new = _calls(pushes)
+    return replace(trace, transition={
+        n: _with(s, substituted(s.distribution, new)) for n, s in trace.transition.items()
+    })  # fmt: skip
+
+
+def pushed(force: Force, pushes: list[tuple[Force, Expr]]) -> Force:
+    """The force as it is in a trace `with_forces` of these."""
+    call = _calls(pushes).get(force.call, force.call)
+    return replace(force, call=call, rate=Expr("item", (call,), force.rate.data))
+
+
+def _calls(pushes: list[tuple[Force, Expr]]) -> dict[Expr, Expr]:
+    """The calls with increments of their forces, by those without."""
     calls: dict[Expr, list[Expr]] = {}
     for force, by in pushes:
         arguments = calls.setdefault(force.call, list(force.call.args))
         arguments[force.place] = arguments[force.place] + by
-    new = {call: Expr(OP, tuple(args), call.data) for call, args in calls.items()}
-    return replace(trace, transition={
-        n: _with(s, substituted(s.distribution, new)) for n, s in trace.transition.items()
-    })  # fmt: skip
+    return {call: Expr(OP, tuple(args), call.data) for call, args in calls.items()}
 
 
 def linear(trace: Trace, pushes: list[tuple[Force, Expr]]) -> Trace:

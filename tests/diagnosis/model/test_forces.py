@@ -166,6 +166,21 @@ def test_the_score_of_a_further_effect_is_taken_where_the_first_one_acts(torque_
         assert drag_.strength in {s.data[1] for s in symbols_of([call.args[7]])}  # f2
 
 
+@pytest.mark.parametrize("torque_noise", [False, True])
+@pytest.mark.parametrize("first", [None, "quadratic drag", "bouc-wen hysteresis", "input delay"])
+def test_effects_with_states_of_their_own_join_those_on_forces(first, torque_noise):
+    """A delay line in the input, the memory of a hysteresis in the force, in the model or new."""
+    names = ["quadratic drag", "bouc-wen hysteresis", "input delay", "coarse discretisation"]
+    traced, found = offered(model_of(torque_noise=torque_noise), names)
+    chosen = [c for c in found if c.effect.name == first][:1]
+    before = augment(traced, chosen) if chosen else traced
+    rest = [c for c in found if c not in chosen]
+    both = augment(before, rest, first_order=True)
+    columns = score_columns(before, both, [c.strength for c in rest], [], Missing(none=True))
+    assert set(columns.names) | set(columns.refused) >= {c.strength for c in rest}
+    assert columns.names
+
+
 def test_the_model_with_an_effect_is_there_where_no_module_has_the_simulator():
     """As one made inside of a function; its file says which name is wanted."""
 
