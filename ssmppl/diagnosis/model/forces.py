@@ -18,7 +18,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.batched.call import OP, Derivative
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
-from ssmppl.expressions.expr import Expr, substitute, symbols_of
+from ssmppl.expressions.expr import Expr, constant, substitute, symbols_of
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.trace import Site, Trace, previous
 
@@ -96,9 +96,11 @@ def linear(trace: Trace, pushes: list[tuple[Force, Expr]]) -> Trace:
 
     Where the force has a noise w of its own, as torque noise is, w + g takes the place of w: its
     mean is g of the states that it acts on, and they follow from it as they did from w (at the
-    first row, which no step leads to, it stays w). Else the rates' means move, by g times their
-    derivatives in the force; what integrates them follows a step later. Either way no deterministic
-    state changes with the strengths, whose derivatives would have to be carried for each of them.
+    first row, which no step leads to, it stays w). What g makes of such noises themselves is left
+    out, as if they were 0 there: a noise cannot have itself in its mean. Else the rates' means
+    move, by g times their derivatives in the force; what integrates them follows a step later.
+    Either way no deterministic state changes with the strengths, whose derivatives would have to be
+    carried for each of them.
     """
     sites, added = dict(trace.transition), dict[str, dict[tuple[int, ...], Expr]]()
 
@@ -106,11 +108,14 @@ def linear(trace: Trace, pushes: list[tuple[Force, Expr]]) -> Trace:
         own = added.setdefault(name, {})
         own[index] = own[index] + by if index in own else by
 
-    for force, by in pushes:
-        noise = _noise_in(force, trace)
+    found = [_noise_in(force, trace) for force, _ in pushes]
+    noises = {s for s in found if s is not None}
+    for (force, by), noise in zip(pushes, found, strict=True):
         if noise is not None:
             lagged = [s for s in symbols_of([by]) if s.data[0].endswith("_prev")]
-            add(noise.data[1], noise.data[2], substitute([by], {s: _now(s) for s in lagged})[0])
+            by = substitute([by], {s: _now(s) for s in lagged})[0]
+            drawn = {s: constant(0.0) for s in symbols_of([by]) if s in noises}
+            add(noise.data[1], noise.data[2], substitute([by], drawn)[0])
             continue
         for name, site in trace.transition.items():
             for index, item in _means(site.distribution).items():
