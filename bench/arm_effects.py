@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from arms import DT, ENCODER, XML, by_sysid, torques
+from arms import ENCODER, XML, by_sysid, simulator, torques
 from table import show
 
 import ssmppl as ssm
@@ -41,11 +41,7 @@ KINDS = {  # what the elbow has, and the effects that say so
 
 def model(xml: str, threads: int) -> ssm.Model:
     """The arm of `arms.py`, with noise in its speeds."""
-    step = ssm.simulators.mujoco(
-        xml, dt=DT, name="arm", threads=threads,
-        parameters={"d1": "shoulder.damping", "d2": "elbow.damping", "m": "fore.mass"},
-    )  # fmt: skip
-    arm = ssm.Model("two-link arm", inputs=("u1", "u2"))
+    step, arm = simulator(xml, threads), ssm.Model("two-link arm", inputs=("u1", "u2"))
 
     @arm.prior
     def prior():

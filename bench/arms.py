@@ -44,12 +44,17 @@ START = {"d1": 0.5, "d2": 0.5, "m": 1.0}  # where mujoco.sysid begins
 DT, SUBSTEPS, ENCODER = 0.02, 10, 0.002
 
 
-def model(threads: int) -> ssm.Model:
-    """The arm, with the noise of each row's torques as states that the next row draws anew."""
-    step = ssm.simulators.mujoco(
-        XML, dt=DT, name="arm", threads=threads,
+def simulator(xml: str, threads: int) -> ssm.Simulator:
+    """An arm, two dampings and a mass its parameters."""
+    return ssm.simulators.mujoco(
+        xml, dt=DT, name="arm", threads=threads,
         parameters={"d1": "shoulder.damping", "d2": "elbow.damping", "m": "fore.mass"},
     )  # fmt: skip
+
+
+def model(threads: int) -> ssm.Model:
+    """The arm, with the noise of each row's torques as states that the next row draws anew."""
+    step = simulator(XML, threads)
     arm = ssm.Model("two-link arm", inputs=("u1", "u2"))
 
     @arm.prior

@@ -165,10 +165,10 @@ class Smoother:
             found, weights, ancestors = _as_particles(paths)
             increments = filtered.increments
             if predicted:
-                states, weights_ = _drawn(
+                states, equal = _drawn(
                     filtered.predicted, filtered.predicted_covariance, stream, self._predictive
                 )
-                self.module.row_predictions_at(given, *data, states, weights_, prediction)
+                self.module.row_predictions_at(given, *data, states, equal, prediction)
                 known = _drawn(filtered.mean, filtered.covariance, stream, CRPS_DRAWS_CALLED)
         else:
             system, weights = self.system(e, own, stream)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ssmppl.inference.optimisation.batched_newton import summed
+from ssmppl.inference.optimisation.batched_newton import parts_of, summed
 from ssmppl.inference.preparation.space import Space
 
 POINTS, SPREAD, CLIMBS = 45, 1.5, 3  # round a start, where many points are looked at together
@@ -38,13 +38,8 @@ def densities_of(
 
     def values(z: np.ndarray) -> np.ndarray:
         found = [space.point(row) for row in z]
-        inside = [k for k, (_, *logs) in enumerate(found) if sum(logs) > -np.inf]
-        if not inside:
-            return np.full((len(z), 1), -np.inf)
-        rows = increments(np.array([found[k][0] for k in inside]))
-        out = np.full((len(z), rows.shape[1] + 1), -np.inf)
-        out[inside] = np.column_stack([rows, [found[k][1] for k in inside]])
-        return out
+        theta, prior, jacobian = (np.array(part) for part in zip(*found, strict=True))
+        return parts_of(increments, theta, np.where(jacobian > -np.inf, prior, -np.inf))
 
     return values
 

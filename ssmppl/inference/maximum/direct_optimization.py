@@ -34,7 +34,7 @@ from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximizati
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.optimisation.batched_newton import climb_together, summed
+from ssmppl.inference.optimisation.batched_newton import climb_together, parts_of, summed
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
 from ssmppl.inference.preparation.exact_models import ExactModel, likelihood_by
 from ssmppl.inference.preparation.space import free_components
@@ -512,14 +512,11 @@ class BatchedClimb:
         density or 0."""
         self.evaluations += len(z)
         found = [self.setup.space.point(row) for row in z]
-        inside = [k for k, (_, log_prior, _) in enumerate(found) if log_prior > -np.inf]
-        if not inside:
-            return np.full((len(z), 1), -np.inf)
-        theta = np.array([found[k][0] for k in inside])
-        rows = self.model.increments(self.setup.problem.experiments, theta)
-        prior = [found[k][1] if self.setup.with_prior else 0.0 for k in inside]
-        out = np.full((len(z), rows.shape[1] + 1), -np.inf)
-        out[inside] = np.column_stack([rows, prior])
+        theta, prior, _ = (np.array(part) for part in zip(*found, strict=True))
+        data = self.setup.problem.experiments
+        out = parts_of(lambda each: self.model.increments(data, each), theta, prior)
+        if not self.setup.with_prior:  # it says where the density is, and no more
+            out[:, -1] = np.where(prior > -np.inf, 0.0, -np.inf)
         total = summed(out)
         k = int(np.argmax(total))
         if total[k] > self.best_value:

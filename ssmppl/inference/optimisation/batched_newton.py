@@ -20,8 +20,7 @@ import numpy as np
 
 from ssmppl.inference.optimisation.newton import Top, bfgs_update, newton_step
 
-# (B, F) -> (B,), -inf where there is no value; or (B, R), the parts of a sum, of which the last has
-# no law that its slopes' outer products would tell of (a log prior).
+# (B, F) -> (B,), -inf where there is no value; or (B, R), the parts of a sum (`parts_of`).
 Function = Callable[[np.ndarray], np.ndarray]
 
 STEPS = 60
@@ -99,7 +98,7 @@ def climb_together(function: Function, starts: np.ndarray, precise: bool = True)
             going = [c for c in going if c.value + c.distance > best.value]
             further -= 1
         elif step >= EARLY:
-            going = [c for c in going if c.value + HOPEFUL * c.distance > best.value]
+            going = [c for c in going if c is best or c.value + HOPEFUL * c.distance > best.value]
         if not (going and further):
             break
         _step(function, going)
@@ -223,6 +222,23 @@ def _slopes(middle: float, up: np.ndarray, down: np.ndarray, h: np.ndarray) -> n
         one_sided = np.where(np.isfinite(up), up - middle, middle - down) / h
         both = (up - down) / (2.0 * h)
     return np.where(np.isfinite(both), both, one_sided)
+
+
+def parts_of(
+    increments: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, log_prior: np.ndarray
+) -> np.ndarray:  # fmt: skip
+    """(B, R + 1) the R increments of a log-likelihood and the log prior density, which is no
+    increment: its slopes' outer products tell nothing. -inf where that is.
+
+    increments : (B', P) parameter vectors -> (B', R). theta : (B, P). log_prior : (B,).
+    """
+    inside = log_prior > -np.inf
+    if not inside.any():
+        return np.full((len(theta), 1), -np.inf)
+    rows = increments(theta[inside])
+    out = np.full((len(theta), rows.shape[1] + 1), -np.inf)
+    out[inside] = np.column_stack([rows, log_prior[inside]])
+    return out
 
 
 def summed(values: np.ndarray) -> np.ndarray:

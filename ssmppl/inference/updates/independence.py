@@ -19,7 +19,7 @@ from scipy.special import gammaln
 
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.batched.extended import Extended
-from ssmppl.inference.optimisation.batched_newton import climb_together, summed
+from ssmppl.inference.optimisation.batched_newton import climb_together, parts_of, summed
 from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.problem import Problem
 
@@ -194,27 +194,18 @@ def targets(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """theta (B, P), log posterior density of z (B, F) and log-likelihood, (B,) each; -inf for
     none."""
-    theta, increments, prior = _parts(space, model, z)
-    likelihood = increments.sum(axis=1)
-    total = np.where(np.isfinite(prior) & (likelihood > -np.inf), prior + likelihood, -np.inf)
+    theta, parts = _parts(space, model, z)
+    total = summed(parts)
+    likelihood = np.where(parts[:, -1] > -np.inf, parts[:, :-1].sum(axis=1), -np.inf)
     return theta, total, likelihood
 
 
-def _parts(
-    space: Space, model: Extended, z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """theta (B, P), the increments (B, R) of the log-likelihood, and the log prior density (B,)."""
+def _parts(space: Space, model: Extended, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """theta (B, P), and the parts (B, R + 1) of the log posterior density (`parts_of`)."""
     found = [(t.copy(), log_prior) for t, log_prior in map(space.parameters, z)]
     theta = np.array([t for t, _ in found]).reshape(len(z), -1)
-    prior = np.array([p for _, p in found])
-    inside = prior > -np.inf
-    rows = sum(e.steps for e in space.problem.experiments)
-    increments = np.full((len(z), rows), -np.inf)
-    if inside.any():
-        known = model.increments(space.problem.experiments, theta[inside])
-        increments = np.full((len(z), known.shape[1]), -np.inf)
-        increments[inside] = known
-    return theta, increments, prior
+    prior, data = np.array([p for _, p in found]), space.problem.experiments
+    return theta, parts_of(lambda each: model.increments(data, each), theta, prior)
 
 
 def mode_of(space: Space, model: Extended, rng: np.random.Generator) -> Any:
@@ -227,7 +218,7 @@ def mode_of(space: Space, model: Extended, rng: np.random.Generator) -> Any:
     z = space.z[space.positions]
 
     def density(points: np.ndarray) -> np.ndarray:
-        return np.column_stack(_parts(space, model, points)[1:])
+        return _parts(space, model, points)[1]
 
     points = np.vstack([z, z + SPREAD * rng.standard_normal((ROUND_START, len(z)))])
     found = climb_together(density, points[np.argsort(-summed(density(points)))[:CLIMBS]])
