@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.diagnosis.model.smoothing import Settings, Smoother
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.language.tracing import trace
 
 T, H, STEPS = 150, 0.01, 5
 
@@ -98,6 +101,19 @@ def test_predictions_of_a_linear_simulator_are_those_of_the_exact_filter():
     # of the sample variance of 64 normal draws, whose sd is sqrt(2 / 64) of it
     assert np.all(np.abs(variance / v - 1.0) < 4.5 * np.sqrt(2.0 / 64))
     assert np.all(np.abs(below - p) < 0.1)
+
+
+def test_a_sensor_that_jumps_is_not_tried():
+    """The extended filter's slope of a sawtooth says nothing of its jumps: on records with nothing
+    missing, quantisation gained 32 nats by that. A written-out model has it tried."""
+    for made, wanted in ((model(), 0), (trend(lambda x, v, a: (x + v, a * v)), 1)):
+        t = trace(made)
+        rng = np.random.default_rng(1)
+        states, y = rng.normal(size=(T, 4, 2)), rng.normal(size=(T, 1))
+        scales = Scales.of(t, states, y, rng.normal(size=(T, len(t.input_symbols))), T)
+        found, refused = offers(t, scales, ["quantisation", "sensor clipping"])
+        assert len({c.effect.name for c in found}) == 1 + wanted
+        assert [r.effect for r in refused if "jumps" in r.reason] == ["quantisation"] * (1 - wanted)
 
 
 @pytest.mark.slow

@@ -244,6 +244,18 @@ def test_a_constraint_solver_begins_anew_at_each_call():
     assert np.array_equal(threads.step(a, u, nothing), first)
 
 
+def test_a_row_that_had_no_value_has_its_own_parameters_afterwards(pendulum):
+    """The models of a batch are kept while its parameters stay the same."""
+    inputs, parameters = np.zeros((3, 2)), np.array([[0.1, 0.7], [0.5, 0.3], [0.2, 0.9]])
+    fine = np.array([[0.4, 0.1], [0.8, -0.2], [0.1, 0.3]])
+    lost = fine.copy()
+    lost[1] = np.nan
+    assert np.isnan(pendulum.step(lost, inputs, parameters)[1]).all()
+    again = pendulum.step(fine, inputs, parameters)
+    alone = [pendulum.step(fine[k:][:1], inputs[:1], parameters[k:][:1])[0] for k in range(3)]
+    assert np.array_equal(again, alone)
+
+
 def test_where_it_diverges_the_result_is_nan_with_a_reason(pendulum, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     state = np.array([[0.1, 0.0], [0.1, 1e11], [np.nan, 0.0], [0.1, 0.0]])

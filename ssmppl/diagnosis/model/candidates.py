@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.diagnosis.effects.candidate import DATED, OF_ROLE, Candidate
 from ssmppl.diagnosis.effects.catalogue import effects as catalogue
 from ssmppl.diagnosis.effects.effect import ON, Effect
@@ -18,7 +19,7 @@ from ssmppl.diagnosis.model.scales import Scales, value_of
 from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import symbols_of
+from ssmppl.expressions.expr import symbols_of, topological
 from ssmppl.language.checks.rules import RESERVED
 from ssmppl.language.model.trace import Trace
 
@@ -44,6 +45,7 @@ class Refused:
         return f"{self.effect}{f' ({self.form})' if self.form else ''}{where}: {self.reason}"
 
 
+SAWTOOTH = frozenset({"floor", "ceil", "mod", "arctan2"})  # operations that jump again and again
 Chosen = Iterable["Effect | str"] | Mapping[str, "Effect | str"] | None
 
 
@@ -301,7 +303,8 @@ def _shapes(
 def _check(candidate: Candidate, equations: Equations) -> str:
     """Call the function once: it has to give the model back at strength 0.
 
-    Returns why an equation that it changes besides its own cannot be changed; "" where all can.
+    Returns why an equation that it changes besides its own cannot be changed, or why no refit could
+    be trusted; "" where there is nothing of the kind.
     """
     change = candidate.change
     role = change if change in ("initial", "observation") else "transition"
@@ -309,6 +312,12 @@ def _check(candidate: Candidate, equations: Equations) -> str:
         role = OF_ROLE[candidate.role]
     bound = bind(candidate, equations, role)
     check_base(candidate, equations, bound, role)
+    if change == "observation" and simulators(equations.trace):
+        if any(n.op in SAWTOOTH for n in topological(bound.changes.values())):
+            return (
+                "a measured value that jumps is not followed by the extended Kalman filter, by "
+                "which a model that calls a simulator is fitted"
+            )
     for label in bound.changes:
         part = equations.parts[label]
         reason = equations.fixed_by_others(part) if label != candidate.equation else ""

@@ -7,7 +7,8 @@ derivatives take many points. Of a log-likelihood whose increments are known row
 begins with the outer products of their slopes (Berndt, Hall, Hall and Hausman, *Annals of Economic
 and Social Measurement* 3, 1974), which cost nothing more; of another function with differences.
 Differences are taken where a step led nowhere, and at the top; between these the slopes update what
-there is (`newton.bfgs_update`). Several climbs go on side by side in the same calls. Where the
+there is (`newton.bfgs_update`), and before a climb ends by that it is held against outer products
+made there. Several climbs go on side by side in the same calls. Where the
 function is not concave, eigenvalues count by their size (`newton.newton_step`).
 """
 
@@ -176,7 +177,7 @@ def _moved(z: np.ndarray, by: dict[int, float]) -> np.ndarray:
 
 def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = None) -> None:
     """Slope, curvature and the next steps from the values at a stencil, that `move` led to."""
-    values, parts = summed(values), values if values.ndim > 1 else None
+    values, parts, size = summed(values), values if values.ndim > 1 else None, c.size
     if tells == SLOPES:
         up, down = np.split(values[1:], 2)
         slope = _slopes(values[0], up, down, c.size)
@@ -193,11 +194,19 @@ def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = 
     missing = ~np.isfinite(slope)
     c.slope = np.where(missing, 0.0, slope)
     c.information = np.where(np.isfinite(curvature), -curvature, 0.0)
-    step = newton_step(c.slope, c.information)
-    c.distance = 0.5 * float(c.slope @ step)
+    c.distance = _distance(c)
+    if tells == SLOPES and parts is not None and c.distance < NEAR:
+        # What was too large once in a direction of no step would be taken for the top.
+        c.information, c.rough = _outer_products(parts, size), True
+        c.distance = _distance(c)
     c.ended = c.distance < GOOD and tells == FINE and not missing.any()
     wanted = np.where(missing, 0.1 * c.size, _sizes(c.information))
     c.size = np.clip(wanted, SHORTEST, LONGEST)
+
+
+def _distance(c: Climber) -> float:
+    """What the quadratic still expects to gain."""
+    return 0.5 * float(c.slope @ newton_step(c.slope, c.information))
 
 
 def _sizes(information: np.ndarray) -> np.ndarray:

@@ -1,8 +1,11 @@
 """Derivatives of a function that takes a batch, against those on paper."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
+from ssmppl.expressions.batched.call import computed, thriftily
 from ssmppl.expressions.batched.differences import FIRST, ONE_SIDED, SECOND, Stencil
 
 X = np.array([[0.3, -1.2], [2.0, 0.0], [-0.7, 40.0]])
@@ -98,3 +101,36 @@ def test_steps_go_by_the_scale():
     assert slope[0, 0, 0] == pytest.approx(1e6, rel=1e-9)
     coarse = stencil.derivatives(lambda p: np.sin(p / 1e-6), x, np.array([1.0]))
     assert abs(coarse[0, 0, 0] - 1e6) > 1e5
+
+
+class Root:
+    """A function with a value on one side of zero only."""
+
+    name, scales = "root", np.ones(1)
+
+    def at(self, points):
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(-points)
+
+
+def test_few_points_take_the_other_side_at_the_end_of_a_range():
+    x = np.array([[-1e-9], [-0.5]])
+    with thriftily():
+        value, slope = computed(Root(), ((), (0,)), x)
+    np.testing.assert_allclose(value[0], np.sqrt(-x[:, 0]))
+    assert np.isfinite(slope).all()
+    assert slope[0, 1] == pytest.approx(-0.5 / np.sqrt(0.5), rel=1e-6)
+
+
+def test_central_differences_come_back_afterwards():
+    asked = []
+
+    class Counted(Root):
+        def at(self, points):
+            asked.append(len(points))
+            return super().at(points)
+
+    for within in (False, True, False):
+        with thriftily() if within else nullcontext():
+            computed(Counted(), ((), (0,)), np.array([[-0.5]]))
+    assert asked == [3, 2, 3]

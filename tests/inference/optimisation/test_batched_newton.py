@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ssmppl.inference.optimisation import batched_newton
 from ssmppl.inference.optimisation.batched_newton import (
     NEAR,
     climb_together,
@@ -120,3 +121,61 @@ def test_second_derivatives_at_a_point():
     at = TOP + [0.1, -0.2, 0.3]
     exact = H - 0.6 * np.diag(at - TOP)
     np.testing.assert_allclose(information_at(function, at, H), exact, rtol=1e-6, atol=1e-6)
+
+
+def test_a_prior_counts_with_its_second_derivatives():
+    """Of a coordinate that the data say nothing of, at the prior's top: slopes there are zero."""
+
+    def parts(z):
+        rows = -0.5 * (z[:, :1] - np.linspace(-1.0, 3.0, 20)) ** 2
+        return np.column_stack([rows, -0.5 * 7.0 * z[:, 1] ** 2])
+
+    found = climb_together(parts, np.zeros((1, 2)), precise=False)
+    assert found.information[1, 1] == pytest.approx(7.0, rel=1e-6)
+    assert found.z[0] == pytest.approx(1.0, abs=0.05)
+
+
+def residuals(z):
+    """Increments of normal residuals, their mean and log sd: far too small an sd at the start."""
+    y = np.random.default_rng(3).normal(2.0, 1.5, 200)
+    with np.errstate(over="ignore"):
+        rows = -z[:, 1:] - 0.5 * (y - z[:, :1]) ** 2 * np.exp(-2.0 * z[:, 1:])
+    return np.column_stack([rows, np.zeros(len(z))])
+
+
+def points_of(starts, monkeypatch, **constants):
+    asked = []
+    for name, value in constants.items():
+        monkeypatch.setattr(batched_newton, name, value)
+
+    def counted(z):
+        asked.append(len(z))
+        return residuals(z)
+
+    found = climb_together(counted, np.array(starts), precise=False)
+    monkeypatch.undo()
+    return found, sum(asked)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0])
+def test_a_climb_does_not_end_where_old_outer_products_say_so(monkeypatch, scale):
+    """Those of the start are many times too large, and the steps do not see all directions."""
+    y = np.random.default_rng(3).normal(2.0, 1.5, 200)
+    top = [y.mean(), np.log(y.std())]
+    found, _ = points_of([[0.0, -3.0]], monkeypatch, LEAST_SCALE=scale)
+    away = found.z - top
+    assert 0.5 * 200.0 * (away[0] ** 2 / y.var() + 2.0 * away[1] ** 2) < 5.0 * NEAR
+
+
+def test_outer_products_that_are_far_too_large_cost_fewer_steps_when_brought_down(monkeypatch):
+    _, points = points_of([[0.0, -3.0]], monkeypatch)
+    _, more = points_of([[0.0, -3.0]], monkeypatch, LEAST_SCALE=1.0)
+    assert points < more
+
+
+def test_climbs_that_cannot_reach_the_highest_wait(monkeypatch):
+    starts = [[0.0, -3.0], [0.0, -6.0], [5.0, -6.0]]
+    found, points = points_of(starts, monkeypatch)
+    same, more = points_of(starts, monkeypatch, EARLY=10**6)
+    assert points < more
+    np.testing.assert_allclose(found.z, same.z, atol=0.05)
