@@ -133,3 +133,19 @@ def test_dry_friction_is_named_and_acts_through_the_force():
 def test_nothing_is_found_where_nothing_is_missing():
     report = ssm.diagnose(model(), record(0.0, 2), mode="fast", progress=False, debug=True)
     assert report.verdict == "no measurable gap"
+
+
+@pytest.mark.slow
+def test_full_mode_hands_the_model_back_and_leaves_nothing_out():
+    """With refits, a second screen and blocks of a short record that are left out."""
+    report = ssm.diagnose(model(), record(0.8, 1), progress=False, debug=True)
+    assert report.verdict == "effect"
+    assert len(report.left_out) == 0
+    best = report.causes.iloc[0]
+    members = report.causes[report.causes["class_id"] == best["class_id"]]
+    assert "coulomb friction" in set(members["effect"])
+    assert set(report.chosen) & set(members["effect"])
+    inputs = {"u": record(0.8, 1)["u"]}
+    values = {n: v for n, (v, _) in report.estimates["after"].items()}
+    again = ssm.simulate(report.model, values, steps=T, inputs=inputs, seed=1)
+    assert np.isfinite(again["q"]).all()
