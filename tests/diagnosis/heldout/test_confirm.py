@@ -112,7 +112,7 @@ def test_a_held_out_row_that_cannot_be_leaves_the_rest_of_the_report(monkeypatch
     assert report.closed.empty
     assert len(report.free_run) == 320
     (note,) = [n for n in report.notes if "share of the reference model's gain" in n]
-    assert "not given: all weights are zero at t=301" in note
+    assert "could not be computed: all weights are zero at t=301" in note
 
 
 @pytest.mark.parametrize("which", [0, 1])

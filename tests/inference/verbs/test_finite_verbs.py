@@ -220,7 +220,7 @@ def test_gibbs_is_chosen_and_has_the_right_posterior(data):
     idata = ssm.sample(weather(), data, draws=3000, warmup=200, seed=5, progress=False)
     attrs = idata["posterior"].attrs
     assert attrs["method"] == "Gibbs"
-    assert "finitely many states" in attrs["method_reason"]
+    assert "finite-state (hidden Markov)" in attrs["method_reason"]
     table = ssm.summary(idata)
     mean, sd = posterior_by_grid(data["y"])
     assert np.all(np.abs(table["mean"] - mean) < 4 * table["mcse_mean"] + 1e-3)
