@@ -4,10 +4,17 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 
 # How long examples take to draw depends on what else the machine does: no test is timed.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
+
+# Hypothesis reads every module that the process has loaded for constants to try as values: 400 of
+# the package and one for each compiled model, more than a minute over a run, and other values in
+# each process.
+if hasattr(providers, "_get_local_constants"):
+    providers._get_local_constants = lambda: providers._local_constants
 
 # A shell without job control starts its background jobs with Ctrl-C ignored; the tests of
 # interrupts would wait for ever.

@@ -120,20 +120,20 @@ def studies() -> dict[str, Study]:
         "PMMH natural scale": ssm.PMMH(particles=60, proposal="bootstrap", scale="natural"),
         "PMMH rescue": ssm.PMMH(particles=60, proposal="bootstrap", rescue=50),
     }
-    twisted = {"PMMH twisted": variants["PMMH twisted"]}
+    twisted = {"PMMH twisted": variants["PMMH twisted"]}  # where there is a Gaussian approximation
     table: dict[str, dict] = {
         "proper_varves": pgas | guided | pmmh | pmmh_guided | twisted,
-        "regression": pgas | look_ahead | pmmh,
-        "two_states": pgas | pmmh,
+        "regression": pgas | look_ahead | pmmh | twisted,
+        "two_states": pgas | pmmh | twisted,
         "counts": pgas | guided | pmmh | variants,
         "stationary": exact | plain | pmmh | twisted,
-        "vector_ar": exact | plain,
-        "vector_ar_apart": exact | plain,
+        "vector_ar": exact | plain | twisted,
+        "vector_ar_apart": exact | plain | twisted,
         "three_regimes": finite | plain | pmmh,
-        "leverage": pgas | guided | pmmh,
-        "ricker": pgas | guided | pmmh,
-        "growth": pgas | pmmh,
-        "bounded": without_elimination | guided | pmmh,
+        "leverage": pgas | guided | pmmh | twisted,
+        "ricker": pgas | guided | pmmh | twisted,
+        "growth": pgas | pmmh | twisted,
+        "bounded": without_elimination | guided | pmmh | twisted,
         "delay": exact | pgas | pmmh | twisted,
     }
     found = [

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 
 from .checks import LEVEL
-from .sbc import BINS, BLOCKS, DELAYED, KEPT, STUDIES, WIDER, calibrate, histogram, uniform_p
+from .sbc import (
+    APPROXIMATED,
+    BINS,
+    BLOCKS,
+    DELAYED,
+    KEPT,
+    STUDIES,
+    WIDER,
+    calibrate,
+    histogram,
+    uniform_p,
+)
 
 SETS = int(os.environ.get("SSMPPL_SBC_SETS", "24"))  # `make exhaustive` asks for 100
 QUANTITIES = sum(len(study.ranked) for study in STUDIES.values())
@@ -26,12 +37,13 @@ def test_statistic_knows_uniform_from_not():
 
 
 # The studies of joint blocks, interweaved moves, eliminated parameters and of the wider models take
-# hours together.
+# hours together, those of chains by the Gaussian approximation but for three models likewise.
 LONG = [
     n for n, s in STUDIES.items()
     if s.model in {*BLOCKS, *WIDER, *DELAYED}
     or "interweaved" in s.label or "eliminated" in s.label
     or n == "two_states PMMH"
+    or (s.model in ("regression", "two_states") and s.method in APPROXIMATED)
 ]  # fmt: skip
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
 

@@ -8,7 +8,7 @@ linear and Gaussian. The twisted filter takes its guide from here.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
 
@@ -19,7 +19,7 @@ from ssmppl.analysis.proposals.curvature import Bend, adjoint_of, bends, seen_ad
 from ssmppl.analysis.proposals.twisted import LookaheadModel, jacobian, lookahead_model
 from ssmppl.analysis.structure import component_means
 from ssmppl.codegen.kernels.gaussian import mode, mode_gradient, mode_moments, unscented
-from ssmppl.codegen.kernels.twisted import lookahead, lookahead_backward
+from ssmppl.codegen.kernels.twisted import guide, lookahead, lookahead_backward
 from ssmppl.codegen.modules.exact import load_kernels
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.module import Layout, ModuleText, Section, Target, listed
@@ -33,7 +33,6 @@ from ssmppl.language.model.trace import Site, Trace
 
 MOST_STEPS = 12  # forward passes that improve the reference of a guide
 CLOSE = 0.05  # nats of improvement with which they end
-SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step that are tried
 KICK = 0.1  # of noise, off a point that is stationary and no maximum
 LEFT = 1e-6  # nats that Newton's method may leave, relative to 1 + |log-likelihood|
 
@@ -269,77 +268,64 @@ class GaussianApproximation:
         return out
 
     def _start(self, given: tuple[np.ndarray, ...]) -> np.ndarray | None:
-        """Noise (T, R') of a trajectory near the data, by the extended Kalman filter."""
-        first, spread = self._empty(len(given[1]))
-        if not self.module.follow_filter(*given, first.x, *spread, *first.derivatives) > -np.inf:
-            return None
-        back = Backward.like(first)
-        if not backward_passes().look_back(first.x, *first.derivatives, 0, *back.arrays):
-            return None
-        for share in SHARES:
-            new, value = self._follow(given, share, first, back)
-            if value > -np.inf:
-                return new.e
-        return np.zeros_like(first.e)
+        """Noise (T, R') of a trajectory near the data, by the extended Kalman filter and one pass
+        of the model itself."""
+        theta, y, seen, u = given
+        found = self.guides(theta, y, seen, u, most_steps=1)
+        return None if found.found[0] == guide.NO_NUMBER else found.e
 
-    # -- the reference of a guide
-    def reference(
-        self, given: tuple[np.ndarray, ...], e: np.ndarray | None = None, at_mode: bool = True
-    ) -> Reference | None:
-        """About the likeliest trajectory, with the model's derivatives along it; None where the
-        extended Kalman filter, which it begins from, comes to no number.
+    # -- the guide of the twisted filter
+    def guides(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray,
+        first: np.ndarray | None = None, e: np.ndarray | None = None, at_mode: bool = False,
+        horizon: int = 0, most_steps: int | None = None,
+    ) -> Guides:  # fmt: skip
+        """About the likeliest trajectories, and the guides along them.
 
-        e : noise (T, R') to begin from instead. at_mode : whether that is the mode at theta, as of
-        `Mode`, so that nothing is left to be done.
+        first : (E + 1,) rows where data sets that lie end to end begin, and where the last one
+            ends; None: there is one.
+        e : noise (R, R') from which the search begins; at_mode : whether it is the mode at theta,
+            as of `Mode`, so that nothing is left to be done. None: from the extended Kalman filter.
+        horizon : rows after which the guide starts anew, blind to what comes later; 0: never.
         """
-        best, spread = self._empty(len(given[1]))
-        value = -np.inf
-        if e is not None:
-            known = replace(best, e=e)
-            best, value = self._follow(given, 0.0, known, Backward.like(known))
-            if value > -np.inf and at_mode:
-                return best
-        first = value > -np.inf
-        if not first:
-            follow = self.module.follow_filter
-            if not follow(*given, best.x, *spread, *best.derivatives) > -np.inf:
-                return None
-        for k in range(int(first), MOST_STEPS):
-            back = Backward.like(best)
-            if not backward_passes().look_back(best.x, *best.derivatives, 0, *back.arrays):
-                break
-            for share in SHARES if k else (1.0,):
-                new, now = self._follow(given, share, best, back)
-                if now > value:
-                    break
-            else:
-                break
-            gained, best, value = now - value, new, now
-            if gained < CLOSE:
-                break
-        return best
+        r, r_initial = len(self.found.transition.noise), len(self.found.initial.noise)
+        rows, d = len(y), len(self.trace.state_symbols)
+        first = np.array([0, rows]) if first is None else first
+        begun = guide.SEARCHED if e is None else guide.AT_MODE if at_mode else guide.BEGUN
+        e = np.zeros((rows, max(r, r_initial))) if e is None else e.copy()
+        columns = d * (d + 1) // 2 + 2 * d + r_initial + r_initial * (r_initial + 1) // 2
+        made = Guides(
+            np.zeros((rows, d)), e, np.zeros((rows, u.shape[1] + columns)),
+            np.zeros(len(first) - 1, dtype=np.int64),
+        )  # fmt: skip
+        self.module.guide_each(
+            theta, y, seen, u, first, begun, MOST_STEPS if most_steps is None else most_steps,
+            CLOSE, (r, r_initial), horizon, made.x, made.e, made.rows, made.found,
+        )  # fmt: skip
+        for i in np.flatnonzero(made.found != guide.GUIDE):  # flat: the transition's own moves
+            a, b = first[i], first[i + 1]
+            made.rows[a:b] = 0.0
+            made.rows[a:b, : u.shape[1]] = u[a:b]
+            at = made.rows.shape[1] - r_initial * (r_initial + 1) // 2  # the factor, by rows
+            made.rows[a, [at + k * (k + 3) // 2 for k in range(r_initial)]] = 1.0
+        return made
 
     def likely_trajectory(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
     ) -> np.ndarray | None:
         """About the likeliest trajectory (T, D) given theta; None where it comes to no number."""
-        found = self.reference((theta, y, seen, u))
-        return found.x if found is not None and np.all(np.isfinite(found.x)) else None
+        made = self.guides(theta, y, seen, u)
+        known = made.found[0] != guide.NO_NUMBER and np.all(np.isfinite(made.x))
+        return made.x if known else None
 
-    def _follow(
-        self, given: tuple[np.ndarray, ...], share: float, old: Reference, back: Backward
-    ) -> tuple[Reference, float]:
-        new = old.like()
-        value = self.module.follow_gains(
-            *given, share, old.x, old.e, back.aim, back.gain, new.x, new.e, *new.derivatives
-        )
-        return new, value
-
-    def _empty(self, steps: int) -> tuple[Reference, tuple[np.ndarray, np.ndarray]]:
+    def _empty(self, steps: int) -> tuple[Linearised, tuple[np.ndarray, np.ndarray]]:
         """Room for an extended Kalman filter: also for its covariances and increments."""
         d = len(self.trace.state_symbols)
-        size = len(self.found.transition.noise), len(self.found.initial.noise)
-        return Reference.empty(steps, d, *size), (np.empty((steps, d, d)), np.empty(steps))
+        r, r_initial = len(self.found.transition.noise), len(self.found.initial.noise)
+        shapes = [(steps, d), (steps, d, d), (steps, d, r), (d, r_initial)]
+        shapes += [(steps, d), (steps, d, d)]
+        found = Linearised(np.zeros((steps, d)), tuple(np.zeros(s) for s in shapes))
+        return found, (np.empty((steps, d, d)), np.empty(steps))
 
 
 @dataclass(frozen=True)
@@ -381,46 +367,26 @@ class Mode:
 
 
 @dataclass(frozen=True)
-class Reference:
-    """A trajectory x (T, D) of noise e (T, R'), and the model's derivatives along it."""
+class Guides:
+    """Trajectories and guides of E data sets end to end, in R rows.
+
+    x (R, D), e (R, R') : about the likeliest states and their noise. rows (R, U + G) : the inputs,
+    and behind them each row's guide: precision, slope, centre; flat, so that particles move by the
+    transition, where there is none. found (E,) : as of the kernel `guide_each`.
+    """
 
     x: np.ndarray
     e: np.ndarray
-    derivatives: tuple[np.ndarray, ...]
-
-    @classmethod
-    def empty(cls, steps: int, d: int, r: int, r_initial: int) -> Reference:
-        """Room for one."""
-        shapes = [(steps, d), (steps, d, d), (steps, d, r), (d, r_initial)]
-        shapes += [(steps, d), (steps, d, d)]
-        noise = np.zeros((steps, max(r, r_initial)))
-        return cls(np.zeros((steps, d)), noise, tuple(np.zeros(s) for s in shapes))
-
-    def like(self) -> Reference:
-        """An empty one of the same sizes."""
-        empty = tuple(np.zeros_like(a) for a in self.derivatives)
-        return Reference(np.zeros_like(self.x), np.zeros_like(self.e), empty)
+    rows: np.ndarray
+    found: np.ndarray
 
 
 @dataclass(frozen=True)
-class Backward:
-    """What a backward pass writes; see `kernels/twisted/lookahead_backward.py`."""
+class Linearised:
+    """A trajectory x (T, D), and the model's derivatives along it."""
 
-    precision: np.ndarray
-    pull: np.ndarray
-    aim: np.ndarray
-    gain: np.ndarray
-
-    @classmethod
-    def like(cls, reference: Reference) -> Backward:
-        """Room for one along a trajectory."""
-        (steps, d), widest = reference.x.shape, reference.e.shape[1]
-        shapes = (steps, d, d), (steps, d), (steps, widest), (steps, widest, d)
-        return cls(*(np.zeros(s) for s in shapes))
-
-    @property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        return self.precision, self.pull, self.aim, self.gain
+    x: np.ndarray
+    derivatives: tuple[np.ndarray, ...]
 
 
 @one_at_a_time
@@ -440,7 +406,10 @@ def compile_gaussian(trace: Trace, missing: Missing) -> GaussianApproximation | 
     own["look_at"] = "look_at"
     out.algorithm(lookahead.most_likely, "most_likely", section, "exact", own)
     own["most_likely"] = "most_likely"
-    for kernel in (lookahead.follow_filter, lookahead.follow_gains):
+    for kernel in (lookahead.filter_pass, lookahead.gains_pass):
+        out.algorithm(kernel, kernel.__name__, section, "exact", dict(own))
+        own[kernel.__name__] = kernel.__name__
+    for kernel in (lookahead.follow_filter, guide.guide_each):
         out.algorithm(kernel, kernel.__name__, section, "entry", own)
     lines = [f"Generated by ssmppl: the Gaussian approximation of the model {trace.name!r}."]
     module = load(out, identifier(trace.name) + "_gaussian", lines)
@@ -516,18 +485,7 @@ def mode_passes() -> ModuleType:
 
 
 @once
-def backward_passes() -> ModuleType:
-    """The backward kernels that know no model, compiled once for all."""
-    kernels = (
-        lookahead_backward.look_back,
-        lookahead_backward.look_back_scalar,
-        lookahead_backward.write_guide,
-    )
-    return load_kernels("guide", "backward passes of the guide", {k.__name__: k for k in kernels})
-
-
-@once
 def backward_passes_of_each() -> ModuleType:
-    """Those over all data sets, likewise."""
+    """Backward kernels that know no model, over all data sets; compiled once for all."""
     kernels = lookahead_backward.look_back_each, lookahead_backward.look_back_scalar_each
     return load_kernels("guides", "the guides of all data sets", {k.__name__: k for k in kernels})

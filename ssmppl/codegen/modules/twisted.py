@@ -18,11 +18,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
 from ssmppl.analysis.proposals.twisted import LookaheadModel, twisted, twisting_order
 from ssmppl.codegen.kernels.twisted import twisting
-from ssmppl.codegen.modules.gaussian import (
-    Backward,
-    GaussianApproximation,
-    backward_passes,
-)
+from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import (
     add_conditional_smc,
@@ -111,7 +107,7 @@ class TwistedFilter:
     proposals: dict[str, Proposal]
     module: Loaded = field(repr=False)
 
-    def entry(self, name: str, proposal: str = "twisted", horizon: int = 0) -> Callable[..., Any]:
+    def entry(self, name: str, proposal: str = "twisted", horizon: int = 0) -> Guided:
         """`filter`, `alive_filter`, `filtered_path` or `conditional_smc`, called like those of
         other proposals.
 
@@ -119,12 +115,7 @@ class TwistedFilter:
         never. Up to the last row of each stretch the particles are worth most as a sample of
         what is known by then.
         """
-        run = getattr(self.module, f"{name}_{proposal}")
-
-        def call(theta: Any, y: Any, seen: Any, u: Any, *rest: Any) -> Any:
-            return run(theta, y, seen, self.guide(theta, y, seen, u, horizon), *rest)
-
-        return call
+        return Guided(getattr(self.module, f"{name}_{proposal}"), self.gaussian, horizon)
 
     def guide(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray, horizon: int = 0,
@@ -132,30 +123,12 @@ class TwistedFilter:
     ) -> np.ndarray:  # fmt: skip
         """The inputs (T, U), and behind them each row's guide: precision, slope, centre.
 
-        e : noise (T, R') of a trajectory from which the search for the likeliest begins; at_mode :
-        whether it is that already.
-
-        A guide that nothing can be computed of is flat: the particles move by the transition.
+        horizon : as of `entry`. e : noise (T, R') of a trajectory from which the search for the
+        likeliest begins; at_mode : whether it is that already.
         """
-        out = np.zeros((len(y), u.shape[1] + len(self.order)))
-        out[:, : u.shape[1]] = u
-        out[0, u.shape[1] + self._ones] = 1.0
-        reference = self.gaussian.reference((theta, y, seen, u), e, at_mode)
-        if reference is None:
-            return out
-        back = Backward.like(reference)
-        if backward_passes().look_back(reference.x, *reference.derivatives, horizon, *back.arrays):
-            found = out.copy()
-            spread = reference.derivatives[3]
-            where = back.precision, back.pull, reference.x, u, back.aim[0], spread, found
-            if backward_passes().write_guide(*where) and np.all(np.isfinite(found)):
-                return found
-        return out
-
-    @cached_property
-    def _ones(self) -> np.ndarray:
-        """Columns, among those of the guide, of the diagonal of the initial noise's factor."""
-        return np.array([k for k, s in enumerate(self.order) if _on_diagonal(s)], dtype=int)
+        return self.gaussian.guides(
+            theta, y, seen, u, e=e, at_mode=at_mode, horizon=horizon
+        ).rows  # fmt: skip
 
     @cached_property
     def order(self) -> list[Expr]:
@@ -164,9 +137,21 @@ class TwistedFilter:
         return twisting_order(len(self.trace.state_symbols), len(found.initial.noise))
 
 
-def _on_diagonal(node: Expr) -> bool:
-    _, name, index = node.data
-    return name == "start_factor" and index[0] == index[1]
+@dataclass(frozen=True)
+class Guided:
+    """A twisted filter's kernel, called like those of other proposals.
+
+    run : the kernel, which takes the guide with the inputs. gaussian : what the guide is made from.
+    horizon : as of `TwistedFilter.entry`.
+    """
+
+    run: Callable[..., Any]
+    gaussian: GaussianApproximation
+    horizon: int = 0
+
+    def __call__(self, theta: Any, y: Any, seen: Any, u: Any, *rest: Any) -> Any:
+        guided = self.gaussian.guides(theta, y, seen, u, horizon=self.horizon)
+        return self.run(theta, y, seen, guided.rows, *rest)
 
 
 @one_at_a_time

@@ -41,7 +41,7 @@ TEXT = "ssmppl: compiling what this kind of model needs, once; it may take a min
 HELPERS: dict[str, Any] = {
     name: vars(home)[name]
     for home, names in (
-        (lookahead, ("look_at", "most_likely")),
+        (lookahead, ("look_at", "most_likely", "filter_pass", "gains_pass")),
         (mode, ("follow_step", "eliminate_all")),
         (unscented, ("predicted_row",)),
         (twisting, twisting.SPECIALISED),

@@ -34,7 +34,7 @@ from ssmppl.codegen.modules.filter_variants import (
     numbered_filter,
     scored_filter,
 )
-from ssmppl.codegen.modules.twisted import TwistedFilter
+from ssmppl.codegen.modules.twisted import Guided
 from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable
@@ -166,17 +166,6 @@ class ParticleLikelihood(_KeepsPaths):
         carried = len(self.problem.program.carried(name))
         modes = found.noise if found is not None and name == "twisted" else None
 
-        def by_mode(
-            i: int, e: Experiment, path: np.ndarray, increment: np.ndarray
-        ) -> tuple[int, int, float]:
-            twisted = self.problem.program.twisted
-            assert isinstance(twisted, TwistedFilter)
-            assert modes is not None
-            assert found is not None
-            guide = twisted.guide(theta, e.y, e.seen, e.u, e=modes[i], at_mode=found.at_mode)
-            run = twisted.module.filtered_path_twisted
-            return run(theta, e.y, e.seen, guide, n, stream, path, increment)
-
         def by_kernel(
             i: int, e: Experiment, path: np.ndarray, increment: np.ndarray
         ) -> tuple[int, int, float]:
@@ -197,10 +186,21 @@ class ParticleLikelihood(_KeepsPaths):
 
         if self.settings.rescue:
             return run_each(self.problem, theta, carried, alive)
-        if modes is not None:
-            return run_each(self.problem, theta, carried, by_mode)
         entry = self.problem.program.entry(f"filtered_path_{name}")
-        return run_each(self.problem, theta, carried, by_kernel)
+        if not isinstance(entry, Guided):
+            return run_each(self.problem, theta, carried, by_kernel)
+        kernel, every = entry.run, self.problem.end_to_end
+        noise = None if modes is None else np.concatenate(modes)
+        at_mode = found is not None and found.at_mode
+        made = entry.gaussian.guides(theta, *every.data, e=noise, at_mode=at_mode)
+        guides = every.split(made.rows)
+
+        def guided(
+            i: int, e: Experiment, path: np.ndarray, increment: np.ndarray
+        ) -> tuple[int, int, float]:
+            return kernel(theta, e.y, e.seen, guides[i], n, stream, path, increment)
+
+        return run_each(self.problem, theta, carried, guided)
 
 
 @dataclass(frozen=True)

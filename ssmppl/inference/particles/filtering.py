@@ -14,6 +14,7 @@ import numpy as np
 from ssmppl.codegen.kernels.data_sets.each import filter_each
 from ssmppl.codegen.kernels.particle.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN, OK
+from ssmppl.codegen.modules.twisted import Guided
 from ssmppl.codegen.native.entries import ByAddress, over_data_sets
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, spelled
@@ -139,7 +140,7 @@ def log_likelihood_estimate(
     """
     one = None if settings.rescue else problem.program.entry(f"filter_{settings.proposal}")
     several, small = len(problem.experiments) > 1, settings.particles < LEAST
-    if several and small and settings.device == "cpu" and isinstance(one, ByAddress):
+    if several and small and settings.device == "cpu" and isinstance(one, ByAddress | Guided):
         return _estimate_of_all(problem, theta, settings, rng, one)
     total = 0.0
     for experiment in problem.experiments:
@@ -154,13 +155,28 @@ def log_likelihood_estimate(
 
 
 def _estimate_of_all(
-    problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray, one: ByAddress
-) -> float:
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray,
+    one: ByAddress | Guided,
+) -> float:  # fmt: skip
     """As `log_likelihood_estimate`, in one compiled pass; one : the filter of a data set."""
     every, scheme = problem.end_to_end, None if settings.scheme == SYSTEMATIC else settings.scheme
     increments, ess = np.empty(problem.rows), np.empty(problem.rows)
-    status, t, e = over_data_sets(filter_each, one)(
-        theta, *every.data, settings.particles, scheme, settings.ess_threshold, rng, increments, ess
+    y, seen, u, first = every.data
+    if isinstance(one, Guided):
+        u = one.gaussian.guides(theta, y, seen, u, first, horizon=one.horizon).rows
+    run = over_data_sets(filter_each, one.run if isinstance(one, Guided) else one)
+    status, t, e = run(
+        theta,
+        y,
+        seen,
+        u,
+        first,
+        settings.particles,
+        scheme,
+        settings.ess_threshold,
+        rng,
+        increments,
+        ess,
     )
     if status == ALL_ZERO:
         return -np.inf

@@ -42,7 +42,7 @@ class EndToEnd:
         return cls(first, *(joined([getattr(e, n) for e in experiments]) for n in _ROWS))
 
     @property
-    def data(self) -> tuple[np.ndarray, ...]:
+    def data(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """y, seen, u and first, as kernels over all data sets take them."""
         return self.y, self.seen, self.u, self.first
 

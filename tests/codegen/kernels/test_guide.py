@@ -12,6 +12,7 @@ import pytest
 from scipy import optimize
 
 import ssmppl as ssm
+from ssmppl.codegen.kernels.twisted import guide
 from ssmppl.codegen.kernels.twisted.lookahead import lift, update
 from ssmppl.codegen.modules import gaussian
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
@@ -298,6 +299,35 @@ def test_flat_where_the_start_is_hopeless(hole, sigma):
     np.testing.assert_array_equal(guide.factor, np.eye(1))
     steered = Guide(made, (np.array([-5.0, 0.5]), *given[1:]))
     assert np.all(steered.precision > 0)
+
+
+def test_guides_of_all_data_sets_are_those_of_each():
+    """Of several lengths, from wherever the search begins; where one has none, that of no other is
+    touched."""
+    rng = np.random.default_rng(6)
+    series = [np.sin(rng.normal(size=n)) for n in (7, 1, 12)]
+    series[1][0] = 1e200  # has no density
+    problem = pose(twisted_models.pendulum, [{"y": y} for y in series])
+    made, every, theta = plainly(problem), problem.end_to_end, np.empty(0)
+    with np.errstate(all="ignore"):
+        searched = made.gaussian.guides(theta, *every.data)
+    assert searched.found.tolist() == [guide.GUIDE, guide.NO_NUMBER, guide.GUIDE]
+    noise = 0.3 * rng.normal(size=searched.e.shape)
+    for e, at_mode in ((None, False), (noise, False), (searched.e, True)):
+        with np.errstate(all="ignore"):
+            found = made.gaussian.guides(theta, *every.data, e=e, at_mode=at_mode)
+        begun = [None] * 3 if e is None else every.split(e)
+        for one, start, rows, x in zip(
+            problem.experiments, begun, every.split(found.rows), every.split(found.x), strict=True
+        ):
+            given = theta, one.y, one.seen, one.u
+            with np.errstate(all="ignore"):
+                alone = made.gaussian.guides(*given, e=start, at_mode=at_mode)
+            np.testing.assert_array_equal(rows, alone.rows)
+            np.testing.assert_array_equal(x, alone.x)
+        if at_mode:
+            np.testing.assert_allclose(found.x, searched.x, atol=1e-12)
+    assert np.any(searched.rows[8:] != 0.0)
 
 
 # -- the parts

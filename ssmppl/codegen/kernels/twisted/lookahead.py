@@ -227,20 +227,13 @@ def most_likely(
 
 
 @exact
-def follow_filter(
-    prepare, step, linear_initial, linear, look_at, most_likely, sizes, flat,
-    theta, y, seen, u, x, covariance, increments, rest, jacobian, spread, spread_initial, g, h,
+def filter_pass(
+    prepare, step, linear_initial, linear, look_at, most_likely, flat, theta, y, seen, u, c, s,
+    x, covariance, increments, rest, jacobian, spread, spread_initial, g, h,
 ):  # fmt: skip
-    """The first reference: an extended Kalman filter; returns its log-likelihood, -inf where it
-    comes to no number, +inf where its covariances do and rounding has eaten the log-likelihood: an
-    observation determines a state better than `RESOLVED`.
-
-    x (T, D) its means, covariance (T, D, D), increments (T,) of the log-likelihood, rest (T, D),
-    jacobian (T, D, D), spread (T, D, R), spread_initial (D, R_1), g (T, D), h (T, D, D) : written.
-    """
+    """`follow_filter`, with room for what is computed once (c) and at a row (s)."""
     n_steps, d = x.shape
     r, r_initial = spread.shape[2], spread_initial.shape[1]
-    c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
     values = np.zeros((d + d * d + d * r, 1))
     told_initial = np.zeros((d + d * r_initial, 1))
@@ -295,20 +288,36 @@ def follow_filter(
 
 
 @exact
-def follow_gains(
-    prepare, step, begin, follow, linear_initial, linear, look_at, sizes,
-    theta, y, seen, u, share, x_old, e_old, aim, gain,
-    x, e, rest, jacobian, spread, spread_initial, g, h,
+def follow_filter(
+    filter_pass, sizes, theta, y, seen, u, x, covariance, increments, rest, jacobian, spread,
+    spread_initial, g, h,
+):  # fmt: skip
+    """The first reference: an extended Kalman filter; returns its log-likelihood, -inf where it
+    comes to no number, +inf where its covariances do and rounding has eaten the log-likelihood: an
+    observation determines a state better than `RESOLVED`.
+
+    x (T, D) its means, covariance (T, D, D), increments (T,) of the log-likelihood, rest (T, D),
+    jacobian (T, D, D), spread (T, D, R), spread_initial (D, R_1), g (T, D), h (T, D, D) : written.
+    """
+    return filter_pass(
+        theta, y, seen, u, np.empty(sizes[0]), np.empty(sizes[1]), x, covariance, increments, rest,
+        jacobian, spread, spread_initial, g, h,
+    )  # fmt: skip
+
+
+@exact
+def gains_pass(
+    prepare, step, begin, follow, linear_initial, linear, look_at, theta, y, seen, u, c, s, share,
+    x_old, e_old, aim, gain, x, e, rest, jacobian, spread, spread_initial, g, h,
 ):  # fmt: skip
     """The model itself, steered by gains; returns log p(e, y) up to a constant, -inf if none.
 
     e_t = e_old_t + share (aim_t - e_old_t) + gain_t (x_{t-1} - x_old_{t-1}).
     aim, e_old, e (T, R'), gain (T, R', D), R' the larger of both laws' noises; x, e and the
-    derivatives along x are written.
+    derivatives along x are written. c, s : room for what is computed once and at a row.
     """
     n_steps, d = x.shape
     r, r_initial = spread.shape[2], spread_initial.shape[1]
-    c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
     values = np.zeros((d + d * d + d * r, 1))
     told_initial = np.zeros((d + d * r_initial, 1))
