@@ -33,6 +33,7 @@ def test_linear_systems_have_their_exact_likelihood():
     assert terms(system, p, e, U, Y)[0].sum() == pytest.approx(exact, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_missing_observations_are_left_out():
     system, p, e, U, Y, data = drawn("thermal", steps=80)
     Y[10:15, 0] = np.nan

@@ -47,6 +47,7 @@ def test_fresh_runs_are_of_the_sets_own_system():
     np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_the_true_model_closes_all_and_the_base_nothing(case):
     data, answer, base, true = case
     all_of_it = share(base, true, true, SYSTEM, answer, data)

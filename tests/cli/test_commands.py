@@ -387,6 +387,7 @@ def test_a_process_of_its_own(series):
     assert Path("sim.nc").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_was_drawn(series):
     process = program(
         "sample", "walk.py", "sim.csv", "--draws", 400, "--warmup", 0, "--chains", 2,

@@ -143,6 +143,7 @@ def limited(place, size):
     return finish(start(place, limit + SCRIPT))
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_no_call(tmp_path):
     """Nothing can be written anywhere; only the text; then there is room again."""
     hits, misses, total, path = limited(tmp_path, 0)

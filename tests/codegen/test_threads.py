@@ -34,6 +34,7 @@ def within_patience(work):
         threads.shutdown(wait=False)
 
 
+@pytest.mark.slow
 def test_many_threads_make_many_models_into_an_empty_cache(tmp_path):
     """None fails in Python's parser, none waits for ever, and each thing is made once."""
     environment = {**os.environ, "SSMPPL_CACHE": str(tmp_path)}

@@ -25,9 +25,9 @@ def check(node, values, symbols=SYMBOLS):
         np.testing.assert_allclose(f, e, rtol=1e-9, atol=1e-11, err_msg=repr(node))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
-    programs(sorted(set(SMOOTH) | set(HALF_SMOOTH) | set(KINKED)), max_size=10),
+    programs(sorted(set(SMOOTH) | set(HALF_SMOOTH) | set(KINKED)), max_size=8),
     some.integers(0, 2**32 - 1),
 )
 def test_random_graphs(program, seed):

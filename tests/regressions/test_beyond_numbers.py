@@ -50,6 +50,7 @@ def boxed(prior=None):
     return model
 
 
+@pytest.mark.slow
 def test_the_evidence_of_impossible_data():
     found = ssm.evidence(boxed(), {"y": [0.0, 100.0, 0.0]}, seed=1, progress=False)
     assert found.log_evidence == -np.inf

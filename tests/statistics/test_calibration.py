@@ -37,13 +37,14 @@ def test_statistic_knows_uniform_from_not():
 
 
 # The studies of joint blocks, interweaved moves, eliminated parameters and of the wider models take
-# hours together, those of chains by the Gaussian approximation but for three models likewise.
+# hours together, those of chains by the Gaussian approximation likewise but for a few.
 LONG = [
     n for n, s in STUDIES.items()
     if s.model in {*BLOCKS, *WIDER, *DELAYED}
     or "interweaved" in s.label or "eliminated" in s.label
     or n == "two_states PMMH"
     or (s.model in ("regression", "two_states") and s.method in APPROXIMATED)
+    or n in ("counts ISMCMC", "proper_varves ISMCMC")
 ]  # fmt: skip
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
 

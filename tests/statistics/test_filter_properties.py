@@ -63,6 +63,7 @@ def test_error_of_filter_means_falls_as_one_over_the_root_of_n():
     assert abs(exponent + 1) < 4 * error
 
 
+@pytest.mark.slow
 def test_variance_of_log_z_grows_linearly():
     """On one stretch of data over and over, so that no T has an outlier that others lack."""
     block = ssm.simulate(models.lgss, PARAMETERS, steps=100, seed=seed_of("block"))["y"].values[0]

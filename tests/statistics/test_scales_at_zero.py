@@ -9,7 +9,7 @@ from scipy import stats
 
 import ssmppl as ssm
 
-from .checks import LEVEL, mcse_mean, seed_of
+from .checks import LEVEL, mcse_mean, seed_of, some
 from .scales_at_zero import (
     QUANTITIES,
     TRUE,
@@ -97,7 +97,7 @@ def test_gibbs_with_scales_at_zero(interweave):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(SEEDS))
+@pytest.mark.parametrize("seed", some(range(SEEDS), 5, pytest.mark.exhaustive))
 @pytest.mark.parametrize("nonlinear", [False, True])
 @pytest.mark.filterwarnings("ignore:the chains")
 def test_ten_seeds_with_scales_at_zero(nonlinear, seed):

@@ -40,7 +40,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 
 from ssmppl.codegen.store import shipped
-from ssmppl.compiling import LOCK, once, one_at_a_time
+from ssmppl.compiling import LOCK, once, one_at_a_time, uncollected
 
 try:
     import fcntl
@@ -266,7 +266,7 @@ class Kept:
         """Numba's `compile(signature)`, which asks here for what is kept, in one process a time."""
 
         def compile_alone(signature: Any) -> Any:
-            with LOCK, contextlib.ExitStack() as self._held:
+            with LOCK, uncollected(), contextlib.ExitStack() as self._held:
                 return compile(signature)
 
         return compile_alone

@@ -67,7 +67,7 @@ def test_level_of_one_group(size):
 def test_level_over_groups(heavy):
     rng, together, alone, either, each = rng_of("many", heavy), [], [], [], []
     world = World(rng, [12, 12, 6, 12, 8], heavy)
-    for _ in range(1000):
+    for _ in range(500):
         s, n = world(B + 1)
         table, found = localise(world.groups(s[:B], s[B]), n[:B], n[B])
         together.append(table["p"].min())
@@ -177,7 +177,7 @@ def test_what_the_catalogue_explains_is_not_left(nats):
     draw, effects, basis = catalogue_world(rng)
     size = effects[:, 0] @ effects[:, 0] + 0.05**2
     strength = np.sqrt(2 * nats / size)
-    for _ in range(400):
+    for _ in range(250):
         c, g, n = draw(B + 1)
         seen = c[B] + strength * (effects.T @ effects[:, 0] + 0.05**2 * np.eye(150)[0])
         p.append(group_score(g[:B], g[B] + strength * basis.T @ effects[:, 0], n[:B], n[B],

@@ -41,6 +41,7 @@ class World:
 
 
 @pytest.mark.parametrize("nats", [0.0, 30.0])
+@pytest.mark.slow
 def test_a_lasting_gap_is_not_confined(nats):
     """The level is 5% without a gap, and with one of 30 nats that acts all the time."""
     world, times = World("level", nats), 150

@@ -312,7 +312,7 @@ class AboutPrior(Collapsed):
         return 0.0, paths
 
 
-@pytest.mark.parametrize("some_of_them", [False, True])
+@pytest.mark.parametrize("some_of_them", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_steps_about_a_mode_leave_the_law_invariant(some_of_them):
     """All numbers, or some given the others, which stay; heavier tails than the Gaussian's."""
     model = ssm.Model("many")

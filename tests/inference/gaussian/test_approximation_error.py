@@ -57,6 +57,7 @@ def exact(case, y):
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.slow
 def test_the_error_of_the_approximate_likelihoods(name):
     case, laplace, extended = CASES[name]
     model, q = case[0], case[3]

@@ -129,6 +129,7 @@ def test_where_it_does_not_apply_it_says_why():
     assert "3 components" in smooth_filter_applies(trace(models.machine)).reason
 
 
+@pytest.mark.slow
 def test_of_many_maxima_of_a_markov_chain_a_high_one_is_found():
     """Three states that start alike, where a climb goes to a saddle or to a maximum of two states:
     whatever the seed, as high as the best of ten climbs from places that tell the states apart."""

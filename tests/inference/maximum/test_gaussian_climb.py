@@ -80,6 +80,7 @@ def point_mass(y, a, s, points=600):
     return total
 
 
+@pytest.mark.slow
 def test_small_counts():
     model, y = counts()
 

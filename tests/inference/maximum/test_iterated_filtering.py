@@ -85,7 +85,7 @@ def filter_of(setup, method):
     return PerturbedFilter(setup.space, setup.with_prior, scales, model.moving, method.cooling)
 
 
-@pytest.mark.parametrize("with_prior", [False, True])
+@pytest.mark.parametrize("with_prior", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_each_particle_carries_its_own_parameters(with_prior):
     """Particles at two atoms that do not step: Z and the final share of an atom are unbiased for
     the mean of the atoms' likelihoods, and for an atom's part of it (times its prior)."""
@@ -187,6 +187,7 @@ def check_ends(found, exact):
         assert error < 0.2 * sd
 
 
+@pytest.mark.slow
 def test_a_linear_gaussian_maximum(exact_values):
     exact = exact_values["lgss_main_text"]
     found = ssm.maximize(models.lgss, LGSS, ssm.IF2(starts=8, iterations=80, particles=1000),

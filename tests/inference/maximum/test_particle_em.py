@@ -42,7 +42,7 @@ def started(setup, theta, settings, *seed):
 @pytest.mark.parametrize(
     "proposal", [pytest.param("bootstrap", marks=pytest.mark.slow), "auxiliary"]
 )
-@pytest.mark.parametrize("name", ["lgss", "companion"])
+@pytest.mark.parametrize("name", [pytest.param("lgss", marks=pytest.mark.slow), "companion"])
 def test_mean_over_all_paths_has_the_expectation_of_the_drawn_one(name, proposal):
     """At a fixed theta, sweep by sweep, against the exact smoother; five particles.
 
@@ -252,6 +252,7 @@ def test_varves(method, exact_values):
     assert abs(found.parameters["tau"] / mle["tau"] - 1) <= 0.02
 
 
+@pytest.mark.slow
 def test_runs_weighed_by_their_likelihoods_have_less_bias():
     """Forty particles: one filter alone is off by many of its errors, six together are not."""
     data = {"y": load("lgss_appendix")["y"][:40]}

@@ -137,6 +137,7 @@ def test_law_given_the_particles(label, kernel, steps, n):
     assert p > LEVEL / len(ENUMERATED)
 
 
+@pytest.mark.slow
 def test_more_moves_come_closer():
     """Total variation of the MCMC kernel's law to the exact one, from the genealogy on."""
     problem, theta, experiment, system = short("one state, gaps", 3, 5)

@@ -52,6 +52,7 @@ def assert_mean_one(log_ratio):
     assert abs(ratio.mean() - 1) < 4 * error
 
 
+@pytest.mark.slow
 def test_unbiased_with_correlated_and_deterministic_states_and_missing_values():
     data = [pair_data(), pair_data(3, 2)]
     (exact,) = ssm.log_likelihood(PAIR, data, AT)

@@ -52,6 +52,7 @@ def test_values_that_contradict_each_other(given, said):
             verb(between(), DATA, **given, progress=False)
 
 
+@pytest.mark.slow
 def test_smc2_with_a_fixed_value_outside_of_bounds_that_were_drawn():
     """b given r is r plus an exponential number, where the data say nothing of b."""
     model = ssm.Model("below")

@@ -134,6 +134,7 @@ def test_options_of_called_functions_are_a_part_of_the_name():
     assert make(fastmath=True).name == make(fastmath=True).name
 
 
+@pytest.mark.slow
 def test_a_name_is_the_same_in_every_process_and_new_where_a_file_changed(tmp_path):
     """Sets, whose order differs from process to process, and libraries among what is read."""
     (tmp_path / "a_model.py").write_text(

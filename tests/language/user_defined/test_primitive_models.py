@@ -60,6 +60,7 @@ def test_likelihoods_are_those_of_the_model_written_out(data, proposal, error):
     np.testing.assert_allclose(found, exact, atol=error, rtol=0)
 
 
+@pytest.mark.slow
 def test_scores_and_maxima_are_those_of_the_model_written_out(data):
     scores = [ssm.score(m, data, THETA, seed=1).gradient for m in (OPAQUE, PLAIN)]
     assert scores[0] == pytest.approx(scores[1], rel=1e-6)
