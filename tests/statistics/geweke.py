@@ -120,7 +120,10 @@ def studies() -> dict[str, Study]:
         "PMMH natural scale": ssm.PMMH(particles=60, proposal="bootstrap", scale="natural"),
         "PMMH rescue": ssm.PMMH(particles=60, proposal="bootstrap", rescue=50),
     }
-    twisted = {"PMMH twisted": variants["PMMH twisted"]}  # where there is a Gaussian approximation
+    # Where there is a Gaussian approximation, but for growth: of its two modes the guide knows one,
+    # log Z scatters by up to 16 over the prior, and no number of independence steps that can be
+    # afforded draws the run of a filter anew.
+    twisted = {"PMMH twisted": variants["PMMH twisted"]}
     table: dict[str, dict] = {
         "proper_varves": pgas | guided | pmmh | pmmh_guided | twisted,
         "regression": pgas | look_ahead | pmmh | twisted,
@@ -132,7 +135,7 @@ def studies() -> dict[str, Study]:
         "three_regimes": finite | plain | pmmh,
         "leverage": pgas | guided | pmmh | twisted,
         "ricker": pgas | guided | pmmh | twisted,
-        "growth": pgas | pmmh | twisted,
+        "growth": pgas | pmmh,
         "bounded": without_elimination | guided | pmmh | twisted,
         "delay": exact | pgas | pmmh | twisted,
     }

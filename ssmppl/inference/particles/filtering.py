@@ -102,11 +102,13 @@ def filter_settings(
 def run_filter(
     problem: Problem, theta: np.ndarray, settings: FilterSettings, experiment: Experiment,
     rng: np.ndarray, log_increments: np.ndarray, ess: np.ndarray, moments: Moments | None = None,
-    kept: Arrays | None = None,
+    kept: Arrays | None = None, guided: np.ndarray | None = None,
 ) -> tuple[int, int]:  # fmt: skip
     """Run the filter over one experiment; (status, t), t the step at which it stopped.
 
     log_increments, ess : (T,), written. moments, kept : as of the kernel `particle_filter`.
+    guided : inputs with the guide at theta (T, U + G), of a twisted filter that need not look for
+        it.
     """
     if settings.device == "cuda":
         return run_on_device(
@@ -126,13 +128,29 @@ def run_filter(
             experiment, rng, log_increments, ess,
         )  # fmt: skip
     run = problem.program.entry(f"filter_{settings.proposal}")
+    if guided is not None and isinstance(run, Guided):
+        run, data = run.run, (theta, experiment.y, experiment.seen, guided, settings.particles)
     return run(*data, scheme, settings.ess_threshold, rng, *out)
 
 
+def guides_at(problem: Problem, theta: np.ndarray, settings: FilterSettings) -> np.ndarray | None:
+    """Inputs with the guide at theta, of all experiments end to end (R, U + G), for several runs of
+    a twisted filter there; None where the filter is another one."""
+    if settings.rescue or settings.device != "cpu":
+        return None
+    run = problem.program.entry(f"filter_{settings.proposal}")
+    if not isinstance(run, Guided):
+        return None
+    return run.gaussian.guides(theta, *problem.end_to_end.data, horizon=run.horizon).rows
+
+
 def log_likelihood_estimate(
-    problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray
-) -> float:
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray,
+    guided: np.ndarray | None = None,
+) -> float:  # fmt: skip
     """One estimate of log p(y | theta), summed over the experiments; -inf where it is zero.
+
+    guided : of `guides_at`, where it is known.
 
     Raises
     ------
@@ -141,11 +159,16 @@ def log_likelihood_estimate(
     one = None if settings.rescue else problem.program.entry(f"filter_{settings.proposal}")
     several, small = len(problem.experiments) > 1, settings.particles < LEAST
     if several and small and settings.device == "cpu" and isinstance(one, ByAddress | Guided):
-        return _estimate_of_all(problem, theta, settings, rng, one)
+        return _estimate_of_all(problem, theta, settings, rng, one, guided)
     total = 0.0
-    for experiment in problem.experiments:
+    rows: list[np.ndarray] | list[None] = [None] * len(problem.experiments)
+    if guided is not None:
+        rows = problem.end_to_end.split(guided)
+    for experiment, own in zip(problem.experiments, rows, strict=True):
         increments, ess = np.empty(experiment.steps), np.empty(experiment.steps)
-        status, t = run_filter(problem, theta, settings, experiment, rng, increments, ess)
+        status, t = run_filter(
+            problem, theta, settings, experiment, rng, increments, ess, guided=own
+        )
         if status == ALL_ZERO:
             return -np.inf
         if status != OK:
@@ -156,14 +179,16 @@ def log_likelihood_estimate(
 
 def _estimate_of_all(
     problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray,
-    one: ByAddress | Guided,
+    one: ByAddress | Guided, guided: np.ndarray | None,
 ) -> float:  # fmt: skip
     """As `log_likelihood_estimate`, in one compiled pass; one : the filter of a data set."""
     every, scheme = problem.end_to_end, None if settings.scheme == SYSTEMATIC else settings.scheme
     increments, ess = np.empty(problem.rows), np.empty(problem.rows)
     y, seen, u, first = every.data
     if isinstance(one, Guided):
-        u = one.gaussian.guides(theta, y, seen, u, first, horizon=one.horizon).rows
+        own = guides_at(problem, theta, settings) if guided is None else guided
+        assert own is not None
+        u = own
     run = over_data_sets(filter_each, one.run if isinstance(one, Guided) else one)
     status, t, e = run(
         theta,
@@ -197,9 +222,11 @@ def repeated_estimates(
     repeats: range,
 ) -> np.ndarray:
     """Independent estimates, one for each number in `repeats`; the same whatever the split."""
-    return np.array(
-        [log_likelihood_estimate(problem, theta, settings, random_state(seed, r)) for r in repeats]
-    )
+    guided = guides_at(problem, theta, settings)  # the same for all
+    return np.array([
+        log_likelihood_estimate(problem, theta, settings, random_state(seed, r), guided)
+        for r in repeats
+    ])  # fmt: skip
 
 
 def log_of_mean(log_z: np.ndarray) -> tuple[float, float]:
