@@ -271,14 +271,14 @@ class GaussianApproximation:
         """Noise (T, R') of a trajectory near the data, by the extended Kalman filter and one pass
         of the model itself."""
         theta, y, seen, u = given
-        found = self.guides(theta, y, seen, u, most_steps=1)
+        found = self.guides(theta, y, seen, u, most_steps=1, wanted=False)
         return None if found.found[0] == guide.NO_NUMBER else found.e
 
     # -- the guide of the twisted filter
     def guides(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray,
         first: np.ndarray | None = None, e: np.ndarray | None = None, at_mode: bool = False,
-        horizon: int = 0, most_steps: int | None = None,
+        horizon: int = 0, most_steps: int | None = None, wanted: bool = True,
     ) -> Guides:  # fmt: skip
         """About the likeliest trajectories, and the guides along them.
 
@@ -287,6 +287,7 @@ class GaussianApproximation:
         e : noise (R, R') from which the search begins; at_mode : whether it is the mode at theta,
             as of `Mode`, so that nothing is left to be done. None: from the extended Kalman filter.
         horizon : rows after which the guide starts anew, blind to what comes later; 0: never.
+        wanted : whether guides are; else there are trajectories only.
         """
         r, r_initial = len(self.found.transition.noise), len(self.found.initial.noise)
         rows, d = len(y), len(self.trace.state_symbols)
@@ -295,13 +296,15 @@ class GaussianApproximation:
         e = np.zeros((rows, max(r, r_initial))) if e is None else e.copy()
         columns = d * (d + 1) // 2 + 2 * d + r_initial + r_initial * (r_initial + 1) // 2
         made = Guides(
-            np.zeros((rows, d)), e, np.zeros((rows, u.shape[1] + columns)),
+            np.zeros((rows, d)), e, np.zeros((rows, u.shape[1] + columns if wanted else 0)),
             np.zeros(len(first) - 1, dtype=np.int64),
         )  # fmt: skip
         self.module.guide_each(
             theta, y, seen, u, first, begun, MOST_STEPS if most_steps is None else most_steps,
             CLOSE, (r, r_initial), horizon, made.x, made.e, made.rows, made.found,
         )  # fmt: skip
+        if not wanted:
+            return made
         for i in np.flatnonzero(made.found != guide.GUIDE):  # flat: the transition's own moves
             a, b = first[i], first[i + 1]
             made.rows[a:b] = 0.0
@@ -314,7 +317,7 @@ class GaussianApproximation:
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
     ) -> np.ndarray | None:
         """About the likeliest trajectory (T, D) given theta; None where it comes to no number."""
-        made = self.guides(theta, y, seen, u)
+        made = self.guides(theta, y, seen, u, wanted=False)
         known = made.found[0] != guide.NO_NUMBER and np.all(np.isfinite(made.x))
         return made.x if known else None
 
