@@ -43,8 +43,8 @@ if hasattr(os, "register_at_fork"):
 
 @contextlib.contextmanager
 def uncollected() -> Iterator[None]:
-    """Garbage is collected later: the collector, which goes through all objects of the process
-    again and again while a compiler makes a million of them, takes a fifth of the time."""
+    """Garbage is collected later: while a compiler makes a million objects, the collector would go
+    through all those of the process again and again. Where it is off already it stays so."""
     if not gc.isenabled():
         yield
         return

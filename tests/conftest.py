@@ -12,8 +12,7 @@ settings.register_profile("untimed", deadline=None, suppress_health_check=[Healt
 settings.load_profile("untimed")
 
 # Hypothesis reads every module that the process has loaded for constants to try as values: 400 of
-# the package and one for each compiled model, more than a minute over a run, and other values in
-# each process.
+# the package and one for each compiled model, so that it tries others in each process.
 if hasattr(providers, "_get_local_constants"):
     providers._get_local_constants = lambda: providers._local_constants
 
@@ -25,7 +24,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_collection_finish(session):
     """What is there when the tests begin, a million objects, stays: the collector of garbage need
-    not go through it again and again, a twelfth of the whole run."""
+    not go through it again and again."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)

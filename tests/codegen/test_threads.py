@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import gc
 import os
 import subprocess
 import sys
@@ -18,7 +19,15 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl import compiling
-from ssmppl.compiling import LOCK, literal, once, once_property, one_at_a_time, parse
+from ssmppl.compiling import (
+    LOCK,
+    literal,
+    once,
+    once_property,
+    one_at_a_time,
+    parse,
+    uncollected,
+)
 from tests.models.statements import build
 
 ROOT = Path(__file__).parents[2]
@@ -205,3 +214,33 @@ def test_a_fork_by_the_thread_that_compiles_does_not_wait():
         process.start()
         process.join(PATIENCE)
     assert process.exitcode == 0
+
+
+# -- garbage
+def test_garbage_waits_for_what_is_made_and_no_longer():
+    """Also within each other, and where it fails; what the user has switched off stays off."""
+
+    @one_at_a_time
+    def inner():
+        return gc.isenabled()
+
+    @one_at_a_time
+    def outer(fails):
+        found = inner(), gc.isenabled()
+        if fails:
+            raise ValueError
+        return found
+
+    assert gc.isenabled()
+    assert outer(False) == (False, False)
+    assert gc.isenabled()
+    with pytest.raises(ValueError):
+        outer(True)
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with uncollected():
+            assert not gc.isenabled()
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

@@ -121,8 +121,8 @@ def studies() -> dict[str, Study]:
         "PMMH rescue": ssm.PMMH(particles=60, proposal="bootstrap", rescue=50),
     }
     # Where there is a Gaussian approximation, but for growth: of its two modes the guide knows one,
-    # log Z scatters by up to 16 over the prior, and no number of independence steps that can be
-    # afforded draws the run of a filter anew.
+    # log Z scatters by several nats at many draws from the prior, and no number of independence
+    # steps that can be afforded draws the run of a filter anew.
     twisted = {"PMMH twisted": variants["PMMH twisted"]}
     table: dict[str, dict] = {
         "proper_varves": pgas | guided | pmmh | pmmh_guided | twisted,

@@ -5,6 +5,7 @@ Algorithm 2 of Schön et al. (2015); see `codegen/kernels/particle/particle_filt
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -179,30 +180,21 @@ def log_likelihood_estimate(
 
 def _estimate_of_all(
     problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray,
-    one: ByAddress | Guided, guided: np.ndarray | None,
+    one: Callable[..., Any], guided: np.ndarray | None,
 ) -> float:  # fmt: skip
     """As `log_likelihood_estimate`, in one compiled pass; one : the filter of a data set."""
     every, scheme = problem.end_to_end, None if settings.scheme == SYSTEMATIC else settings.scheme
     increments, ess = np.empty(problem.rows), np.empty(problem.rows)
     y, seen, u, first = every.data
     if isinstance(one, Guided):
-        own = guides_at(problem, theta, settings) if guided is None else guided
-        assert own is not None
-        u = own
-    run = over_data_sets(filter_each, one.run if isinstance(one, Guided) else one)
-    status, t, e = run(
-        theta,
-        y,
-        seen,
-        u,
-        first,
-        settings.particles,
-        scheme,
-        settings.ess_threshold,
-        rng,
-        increments,
-        ess,
-    )
+        if guided is None:
+            guided = guides_at(problem, theta, settings)
+        assert guided is not None
+        one, u = one.run, guided
+    status, t, e = over_data_sets(filter_each, one)(
+        theta, y, seen, u, first, settings.particles, scheme, settings.ess_threshold, rng,
+        increments, ess,
+    )  # fmt: skip
     if status == ALL_ZERO:
         return -np.inf
     if status != OK:

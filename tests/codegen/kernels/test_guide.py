@@ -330,6 +330,35 @@ def test_guides_of_all_data_sets_are_those_of_each():
     assert np.any(searched.rows[8:] != 0.0)
 
 
+def test_shorter_steps_where_the_full_one_is_impossible():
+    """Of one state that goes nowhere: the passes tell what is tried, and how high it leads."""
+    tried = []
+
+    def filter_pass(theta, y, seen, u, c, s, x, covariance, increments, *derivatives):
+        for array, value in zip(derivatives, (0.0, 1.0, 1.0, 1.0, 1.0, 1.0), strict=True):
+            array[:] = value  # rest, jacobian, spread, spread_initial, g, h
+        return 0.0
+
+    def gains_pass(
+        theta, y, seen, u, c, s, share, x_old, e_old, aim, gain, x, e, *derivatives
+    ):  # fmt: skip
+        tried.append(share)
+        e[:] = share
+        filter_pass(theta, y, seen, u, c, s, x, None, None, *derivatives)
+        return -np.inf if share > 0.2 else -1.0
+
+    n, out = 3, np.zeros((3, 5))
+    x, e, found = np.zeros((n, 1)), np.zeros((n, 1)), np.zeros(1, dtype=np.int64)
+    plain = getattr(guide.guide_each, "py_func", guide.guide_each)
+    plain(
+        filter_pass, gains_pass, (0, 0), None, np.zeros((n, 1)), np.zeros((n, 1)),
+        np.zeros((n, 0)), np.array([0, n]), guide.SEARCHED, 12, 0.05, (1, 1), 0, x, e, out, found,
+    )  # fmt: skip
+    assert tried == [*guide.SHARES[:3], *guide.SHARES]  # and then none leads higher
+    assert found[0] == guide.GUIDE
+    np.testing.assert_array_equal(e, 0.2)
+
+
 # -- the parts
 def test_lift_is_the_positive_part():
     """The nearest positive semidefinite matrix, by its eigenvalues."""

@@ -14,10 +14,15 @@ from ssmppl.analysis.proposals import twisted as analysis
 from ssmppl.analysis.proposals.twisted import DEFENSIVE
 from ssmppl.codegen.kernels.particle.particle_filter import GUIDED_SHARE
 from ssmppl.codegen.modules import program
+from ssmppl.codegen.native.entries import ByAddress
 from ssmppl.datasets import ice_varves
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.chains.pmmh import ParticleLikelihood
-from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
+from ssmppl.inference.particles.filtering import (
+    FilterSettings,
+    log_likelihood_estimate,
+    repeated_estimates,
+)
 from ssmppl.inference.preparation import proposal_choice
 from ssmppl.inference.preparation.proposal_choice import ENOUGH, choose_by_pilot
 from ssmppl.inference.run.problem import pose
@@ -443,3 +448,58 @@ def test_conditional_smc_with_twenty_noises(ring):
         progress=False, seed=seed_of("ring pgas"),
     )  # fmt: skip
     assert_moments(idata["posterior"]["x"].values, dense, "ring", 1)
+
+
+# -- several data sets
+@ssm.primitive
+def with_room(v):
+    room = np.zeros(2)
+    room[0] = np.sin(v)
+    return room.sum()
+
+
+roomy = ssm.Model("roomy")
+roomy.prior(lambda: {"a": ssm.Normal(0, sd=1)})
+roomy.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+roomy.transition(lambda x, a: {"x": ssm.Normal(a * x, sd=0.5)})
+roomy.observation(lambda x: {"y": ssm.Normal(with_room(x), sd=0.3)})
+PANELS = {  # whether the model's functions are called by address, or compiled by Numba
+    "volatility": (volatility, np.array([-5.0, 0.5]), True),
+    "roomy": (roomy, np.array([0.5]), False),
+}
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("name", ["volatility", pytest.param("roomy", marks=pytest.mark.slow)])
+def test_data_sets_and_repeats_share_calls_and_not_numbers(name, count):
+    """Of each data set by itself, its guide looked for anew, one random stream through all; a
+    trajectory likewise."""
+    model, theta, by_address = PANELS[name]
+    rng = np.random.default_rng(seed_of("panel", name))
+    data = [{"y": 0.3 * rng.normal(size=n)} for n in (6, 1, 9)[:count]]
+    data[-1]["y"][2:3] = np.nan
+    problem, settings = pose(model, data), FilterSettings(8, "twisted")
+    seed = np.random.SeedSequence(seed_of("panel", name, count))
+    run = problem.program.entry("filter_twisted")
+    assert isinstance(run.run, ByAddress) is by_address
+    alone = []
+    for k in range(3):
+        stream, total = random_state(seed, k), 0.0
+        for e in problem.experiments:
+            increments, ess = np.empty(e.steps), np.empty(e.steps)
+            run(theta, e.y, e.seen, e.u, 8, None, 1.0, stream, increments, ess, None, None)
+            total += increments.sum()
+        alone.append(total)
+    assert len(set(alone)) == 3
+    np.testing.assert_allclose(
+        repeated_estimates(problem, theta, settings, seed, range(3)), alone, rtol=1e-12
+    )
+    found = log_likelihood_estimate(problem, theta, settings, random_state(seed, 2))
+    np.testing.assert_allclose(found, alone[2], rtol=1e-12)
+
+    path_of, stream = problem.program.entry("filtered_path_twisted"), random_state(seed, 7)
+    found = ParticleLikelihood(problem, settings).run(theta, None, random_state(seed, 7))
+    for e, path in zip(problem.experiments, found.paths, strict=True):
+        expected = np.empty_like(path)
+        path_of(theta, e.y, e.seen, e.u, 8, stream, expected, np.empty(e.steps))
+        np.testing.assert_array_equal(path, expected)

@@ -1,8 +1,8 @@
 """The guides of a twisted particle filter over data sets end to end, in one compiled call.
 
 For each data set a trajectory to linearise along is searched for, forward and backward by turns
-(`lookahead.py`, `lookahead_backward.py`), and the guide along it written. For a series of 25 rows
-the passes take a quarter of the time that they take called one by one from Python.
+(`lookahead.py`, `lookahead_backward.py`), and the guide along it written. Of short series the
+passes take less time than calling each of them from Python would.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def guide_each(
         aim, gain = np.zeros((n, widest)), np.zeros((n, widest, d))
         found[i] = NO_NUMBER
         value, steps, ended, starting = -np.inf, 0, False, begun != SEARCHED
-        # Each pass is called at one place, and arrays are filled by entries: what Numba writes for
-        # slices takes a quarter more of compilation.
+        # Each pass is called at one place, and arrays are filled by entries: every further call,
+        # and what Numba writes for slices, adds seconds to the compilation.
         e_old = e[begin:end]
         while True:
             if not starting:
