@@ -330,13 +330,15 @@ def test_guides_of_all_data_sets_are_those_of_each():
     assert np.any(searched.rows[8:] != 0.0)
 
 
-def test_shorter_steps_where_the_full_one_is_impossible():
-    """Of one state that goes nowhere: the passes tell what is tried, and how high it leads."""
+def searched(gains, slope=1.0):
+    """The search in plain Python, of one state that goes nowhere: what the passes are tells `gains`
+    by the share of a step. The shares tried, what was found, and the noise there."""
     tried = []
 
     def filter_pass(theta, y, seen, u, c, s, x, covariance, increments, *derivatives):
-        for array, value in zip(derivatives, (0.0, 1.0, 1.0, 1.0, 1.0, 1.0), strict=True):
-            array[:] = value  # rest, jacobian, spread, spread_initial, g, h
+        # rest, jacobian, spread, spread_initial, g, h
+        for array, value in zip(derivatives, (0.0, 1.0, 1.0, 1.0, slope, 1.0), strict=True):
+            array[:] = value
         return 0.0
 
     def gains_pass(
@@ -345,18 +347,39 @@ def test_shorter_steps_where_the_full_one_is_impossible():
         tried.append(share)
         e[:] = share
         filter_pass(theta, y, seen, u, c, s, x, None, None, *derivatives)
-        return -np.inf if share > 0.2 else -1.0
+        return gains(share)
 
     n, out = 3, np.zeros((3, 5))
     x, e, found = np.zeros((n, 1)), np.zeros((n, 1)), np.zeros(1, dtype=np.int64)
-    plain = getattr(guide.guide_each, "py_func", guide.guide_each)
-    plain(
+    guide.guide_each.py_func(
         filter_pass, gains_pass, (0, 0), None, np.zeros((n, 1)), np.zeros((n, 1)),
         np.zeros((n, 0)), np.array([0, n]), guide.SEARCHED, 12, 0.05, (1, 1), 0, x, e, out, found,
     )  # fmt: skip
+    return tried, int(found[0]), e
+
+
+def test_shorter_steps_where_the_full_one_is_impossible():
+    tried, found, e = searched(lambda share: -np.inf if share > 0.2 else -1.0)
     assert tried == [*guide.SHARES[:3], *guide.SHARES]  # and then none leads higher
-    assert found[0] == guide.GUIDE
+    assert found == guide.GUIDE
     np.testing.assert_array_equal(e, 0.2)
+
+
+def test_a_guide_of_which_something_is_no_number_is_none():
+    """The slope of the observation's density, of which the precision knows nothing."""
+    assert searched(lambda share: -1.0)[1] == guide.GUIDE
+    with np.errstate(invalid="ignore"):
+        assert searched(lambda share: -1.0, slope=np.inf)[1] == guide.REFERENCE
+
+
+def test_a_flat_guide_has_the_inputs():
+    made, (theta, y, seen, u), *_ = case("correlated")
+    with np.errstate(all="ignore"):
+        found = made.gaussian.guides(theta, np.full_like(y, 1e200), seen, u)
+    assert found.found[0] == guide.NO_NUMBER
+    np.testing.assert_array_equal(found.rows[:, : u.shape[1]], u)
+    flat = np.zeros(found.rows.shape[1] - u.shape[1])
+    np.testing.assert_array_equal(found.rows[1:, u.shape[1] :], np.tile(flat, (STEPS - 1, 1)))
 
 
 # -- the parts
