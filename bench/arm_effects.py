@@ -1,7 +1,7 @@
 """What a two-link arm in MuJoCo lacks, by `ssm.diagnose` on records of arms that have more.
 
-    python bench/arm_effects.py [--kinds friction stop delay drag none] [--seeds 5] [--rows 500]
-        [--mode full] [--threads 2]
+    python bench/arm_effects.py [--kinds friction stop delay drag none] [--seeds 1 2 3 4 5]
+        [--rows 500] [--mode full] [--threads 2]
 
 The real arm is the model's file with one thing more, which the diagnosis is not told: dry friction
 in the elbow (`frictionloss`), a stop at 65 degrees either way, motors that act four rows late, a
@@ -112,14 +112,14 @@ def sysid(data: Mapping[str, np.ndarray]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])
     parser.add_argument("--rows", type=int, default=500)
     parser.add_argument("--mode", default="full", choices=("fast", "full"))
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     logging.getLogger("absl").setLevel(logging.ERROR)
     arm, rows = model(XML, options.threads), []
-    for seed in range(1, options.seeds + 1):
+    for seed in options.seeds:
         for kind in options.kinds:
             data = record(kind, options.rows, seed)
             begun, cpu = time.perf_counter(), time.process_time()
