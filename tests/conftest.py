@@ -1,5 +1,6 @@
 import gc
 import json
+import os
 import signal
 from pathlib import Path
 
@@ -15,6 +16,9 @@ settings.load_profile("untimed")
 # the package and one for each compiled model, so that it tries others in each process.
 if hasattr(providers, "_get_local_constants"):
     providers._get_local_constants = lambda: providers._local_constants
+
+# The suite's own processes keep the processors busy.
+os.environ.setdefault("SSMPPL_ONE_COMPILER", "1")
 
 # A shell without job control starts its background jobs with Ctrl-C ignored; the tests of
 # interrupts would wait for ever.

@@ -48,6 +48,8 @@ except ImportError:  # Windows: each process compiles for itself
     fcntl = None  # type: ignore[assignment]
 
 PATIENCE = 120.0  # seconds that a process waits for another that compiles what it needs
+on_missing: list[Callable[[], None]] = []
+"""Called when something turns out not to be compiled."""
 
 
 def cache_folder() -> Path:
@@ -280,6 +282,8 @@ class Kept:
             from_wheel = shipped.find(self.shipped_name(signature), kernels_digest())
             if from_wheel is not None:
                 return _rebuilt(target, from_wheel)
+            for call in tuple(on_missing):
+                call()
             self._held.enter_context(one_process(name))
             found = kept_bytes(name, ".nbc")
         return None if found is None else _rebuilt(target, found)

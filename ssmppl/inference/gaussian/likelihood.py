@@ -66,6 +66,15 @@ class LaplaceLikelihood:
         return value, total
 
 
+def use_mode(problem: Problem, theta: np.ndarray) -> None:
+    """The search for a mode at theta (P,), so that it is compiled: from no noise, without what a
+    search usually begins with."""
+    found, e = problem.program.gaussian, problem.experiments[0]
+    assert isinstance(found, GaussianApproximation)
+    noises = max(len(found.found.initial.noise), len(found.found.transition.noise))
+    found.laplace(theta, e.y, e.seen, e.u, np.zeros((e.steps, noises)))
+
+
 @dataclass(frozen=True)
 class Approximated:
     """An approximate log p(y | theta), -inf where it is not finite; with noise (T, R') of each

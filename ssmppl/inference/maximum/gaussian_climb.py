@@ -10,7 +10,7 @@ the top rests. The slopes' scatter over the seeds gives the estimate's Monte Car
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -20,8 +20,9 @@ import numpy as np
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.twisted import TwistedFilter
+from ssmppl.codegen.store.beforehand import beforehand
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood
+from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood, use_mode
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.edges import Edges, edges
 from ssmppl.inference.methods.methods import DirectOptimization
@@ -75,8 +76,9 @@ class GaussianClimb:
     def run(self) -> Ascent:
         """Both. Ctrl-C ends it early, with the best so far."""
         try:
-            top, started = self._climbed()
-            information = self.information(top.z)
+            with beforehand(*self._later()):
+                top, started = self._climbed()
+                information = self.information(top.z)
         except KeyboardInterrupt:
             if not len(self.best):
                 raise
@@ -119,6 +121,17 @@ class GaussianClimb:
             self._natural(found.z, found.information),
             self.setup.natural_error(found.z, found.error), held=held,
         )  # fmt: skip
+
+    def _later(self) -> tuple[Callable[[], object], ...]:
+        """What the climb comes to, and its correction, for another process to compile."""
+        problem, theta = self.setup.problem, self.setup.space.theta
+        calls: list[Callable[[], object]] = [partial(use_mode, problem, theta)]
+        if isinstance(problem.program.twisted, TwistedFilter):
+            sets = range(len(problem.experiments))
+            streams = [random_state(np.random.SeedSequence(0), i) for i in sets]
+            nowhere = [None for _ in sets]
+            calls.append(partial(twisted_log_z, problem, FEWEST, [streams], nowhere, theta))
+        return tuple(calls)
 
     def _edges(self, z: np.ndarray, information: np.ndarray) -> Edges | None:
         """Which parameters are at an edge of their support, with information about all others;

@@ -6,13 +6,14 @@ import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ssmppl.analysis.structure import singular_covariance
+from ssmppl.codegen.store.beforehand import beforehand
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
@@ -23,6 +24,7 @@ from ssmppl.inference.chains.sampling import GO_ON, SamplingMethod, SamplingSetu
 from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
+from ssmppl.inference.gaussian.likelihood import use_mode
 from ssmppl.inference.methods.methods import (
     ISMCMC,
     PGAS,
@@ -34,7 +36,7 @@ from ssmppl.inference.methods.methods import (
 )
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
-from ssmppl.inference.preparation.gaussian_pilot import precise_twisted
+from ssmppl.inference.preparation.gaussian_pilot import approximation_kind, precise_twisted
 from ssmppl.inference.preparation.method_choice import choose_sampler, only_counts, why_stuck
 from ssmppl.inference.preparation.space import Space, free_components, space_of
 from ssmppl.inference.run.convergence import have_mixed, mixing_attributes
@@ -48,6 +50,8 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.transforms import transforms
 from ssmppl.results import to_inference_data
 
+TRIED_OUT = 4  # draws, and as many before them
+FEW_SETS = 2  # what passes over several data sets need is compiled for two as for any number
 # The methods, under the classes of their settings.
 METHODS: dict[type, SamplingMethod] = {
     MetropolisHastings: metropolis.METHOD,
@@ -276,11 +280,29 @@ def _chosen(space: Space, fixed_values: dict[str, np.ndarray]) -> tuple[Method, 
     stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
     drawn = not isinstance(exact, NotApplicable) and singular is None
     updates = plan_updates(problem, fixed_values) if drawn else ()
-    twisted = precise_twisted(space) if isinstance(exact, NotApplicable) else None
-    counted = only_counts(problem.trace)
-    return choose_sampler(
-        exact_kind(exact), updates, numbers, stuck, singular, twisted, counted=counted
-    )
+    choose = partial(
+        choose_sampler, exact_kind(exact), updates, numbers, stuck, singular,
+        counted=only_counts(problem.trace),
+    )  # fmt: skip
+    if not isinstance(exact, NotApplicable):
+        return choose()
+    other = choose()[0]
+    tried: list[Method] = [other]
+    if isinstance(other, PGAS) and other.interweave == "auto":
+        tried.insert(0, replace(other, interweave=True))
+    calls = [partial(_try_out, space, fixed_values, m) for m in tried]
+    if approximation_kind(problem) == "laplace":
+        calls.insert(0, partial(use_mode, problem, space.theta))
+    with beforehand(*calls):
+        return choose(twisted=precise_twisted(space))
+
+
+def _try_out(space: Space, fixed_values: dict[str, np.ndarray], chosen: Method) -> None:
+    """A few draws by a method given a few data sets, so that what it needs is compiled."""
+    problem = replace(space.problem, experiments=space.problem.experiments[:FEW_SETS])
+    space, root = replace(space, problem=problem), np.random.SeedSequence(0)
+    setup = SamplingSetup(problem, space, fixed_values, 1, TRIED_OUT, 1, root)
+    METHODS[type(chosen)].draw(setup, chosen, TRIED_OUT, None, False, None)
 
 
 def _to_arviz(
