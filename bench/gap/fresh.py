@@ -5,7 +5,8 @@
 The reference C is the true model, refitted to the first 70% of the rows (its parameters and its
 effects' strengths). F of the report's model and its interval are made by the tool's own
 `ssmppl.diagnosis.heldout.gain_ratio` on the held-out rows. F* is the same ratio at the same fitted
-parameters, over the held-out rows of 20 fresh runs of the true system with the same inputs.
+parameters, over the held-out rows of 20 fresh runs of the true system with the same inputs (in a
+closed loop, with the same references).
 Opens the answers:
 run it after the diagnosis, before `score.py`, which reads `cache/fresh.json`.
 """
@@ -90,12 +91,17 @@ def share(
     found = gain_ratio(*parts)
     p = parameters(system, answer)
     e = system.strengths({x["key"]: x["strength"] for x in answer["effects"]})
-    U, _ = arrays(system, data)
+    excited, _ = arrays(system, data)
+    if system.control is not None:  # the same references: the commands are each run's own
+        again = np.random.default_rng(answer["seed"])
+        system.drawn_parameters(again)
+        excited = system.excite(again, len(data))
     total = np.zeros(2)
     for k in range(RUNS):
         rng = np.random.default_rng([answer["seed"], 1 + k])
-        _, Y = system.simulate(p, e, U, rng)
+        U, _, Y = system.recorded(p, e, excited, rng)
         fresh = data.copy()
+        fresh[list(system.inputs)] = U
         fresh[list(system.channels)] = Y
         l0, lk, lc = (rows(fresh, 1)[0, cut:].sum() for rows in (base, effect, true))
         total += lk - l0, lc - l0

@@ -38,8 +38,19 @@ def test_the_plan_has_the_cells_of_the_split():
     assert found == {
         (cell, half): n for cell, counts in SPLIT["cells"].items() for half, n in counts.items()
     }
-    assert len({e.id for e in entries()}) == len(entries()) == 320
-    assert len({e.seed for e in entries()}) == 320
+    assert len({e.id for e in entries()}) == len(entries()) == 680
+    assert len({e.seed for e in entries()}) == 680
+
+
+def test_every_system_of_the_sealed_half_has_ten_sets_of_a_cell():
+    found = Counter(
+        (e.system, "none" if e.cell in NONE else e.cell) for e in entries() if e.half == "sealed"
+    )
+    assert found == {
+        (system, cell): 20 if cell == "none" else 10
+        for system in SPLIT["halves"]["sealed"]["systems"]
+        for cell in ("one-20", "one-50", "two-50", "outside-50", "none")
+    }
 
 
 def test_cells_hold_the_effects_they_say_in_the_systems_of_their_half():
@@ -148,6 +159,7 @@ def test_selecting_sets():
         half="tuning", subset="ci", cell="two-50"
     )
     assert len(run.selected(half="confirm")) == 160
+    assert len(run.selected(half="sealed")) == 360
     assert run.selected(ids=["t003"]) == ["t003"]
 
 

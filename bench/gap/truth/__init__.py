@@ -5,11 +5,17 @@ Nothing under `systems/` imports from here; `run.py` does not either.
 
 from bench.gap.truth import (
     cart_pole,
+    cascade,
+    chemostat,
     epidemic,
+    hot_plate,
     motor_belt,
     oscillator,
     pendulum,
     predator_prey,
+    servo,
+    ship_steering,
+    swing,
     thermal,
     two_tanks,
 )
@@ -19,6 +25,7 @@ SYSTEMS: dict[str, System] = {
     module.SYSTEM.name: module.SYSTEM
     for module in (
         oscillator, pendulum, cart_pole, two_tanks, thermal, motor_belt, predator_prey, epidemic,
+        servo, cascade, hot_plate, ship_steering, swing, chemostat,
     )
 }  # fmt: skip
 

@@ -93,6 +93,19 @@ def forget(tau):
     return 0.0 if tau < 1e-3 else np.exp(-1.0 / tau)
 
 
+@njit
+def rk4(rate, x, v, h, z, u, t, p, e):
+    """Position and speed after a time h of x' = v, v' = rate(x, v, z, u, t, p, e)."""
+    a1 = rate(x, v, z, u, t, p, e)
+    v2 = v + 0.5 * h * a1
+    a2 = rate(x + 0.5 * h * v, v2, z, u, t, p, e)
+    v3 = v + 0.5 * h * a2
+    a3 = rate(x + 0.5 * h * v2, v3, z, u, t, p, e)
+    v4 = v + h * a3
+    a4 = rate(x + h * v3, v4, z, u, t, p, e)
+    return x + h * (v + 2 * v2 + 2 * v3 + v4) / 6, v + h * (a1 + 2 * a2 + 2 * a3 + a4) / 6
+
+
 def driven(U: np.ndarray, e: np.ndarray) -> np.ndarray:
     """What reaches the system of the measured inputs (T, m): the effects act on the first."""
     if not e[list(ON_INPUT)].any():

@@ -40,6 +40,11 @@ class System:
     the law of the next state and of the channels: independent normals, a share `wild` of them four
     times wider; with `counts`, Poisson of that mean. p: positive parameters in their order, e:
     strengths (zero: the base model), t: row from 1.
+
+    control : of a closed loop: control(y, reference, memory) gives the row's inputs from what is
+        measured in that row, and keeps what it needs in `memory`, zeros at first. `excite` then
+        gives references, not inputs, and `observe` does not look at u, which comes after it.
+    resolution : of the sensors, whose readings are whole multiples of it; 0 where they are not.
     """
 
     name: str
@@ -54,6 +59,9 @@ class System:
     excite: Callable[[np.random.Generator, int], np.ndarray]  # (T, inputs)
     effects: dict[str, Effect] = field(default_factory=dict)
     counts: bool = False
+    control: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
+    memory: int = 0
+    resolution: float = 0.0
 
     @property
     def inside(self) -> dict[str, Effect]:
@@ -79,12 +87,22 @@ class System:
     def simulate(
         self, p: np.ndarray, e: np.ndarray, U: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """States (T, n) and observations (T, channels) of one run driven by U (T, inputs)."""
-        V = np.ascontiguousarray(driven(U, e))
-        T, n, m = len(U), len(self.start), len(self.channels)
+        """States (T, n) and observations (T, channels) of one run driven by U (T, inputs), or of
+        a closed loop that follows the references U."""
+        return self.recorded(p, e, U, rng)[1:]
+
+    def recorded(
+        self, p: np.ndarray, e: np.ndarray, excited: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Inputs (T, inputs), states (T, n) and observations (T, channels) of one run; `excited`
+        is what `excite` gives."""
+        T, n, m = len(excited), len(self.start), len(self.channels)
+        U = excited if self.control is None else np.zeros((T, len(self.inputs)))
+        V = np.ascontiguousarray(driven(U, e) if self.control is None else U.copy())
         X, Y = np.empty((T, n)), np.empty((T, m))
         mean, sd = np.zeros(n), np.zeros(n)
         level, spread, wild = np.zeros(m), np.zeros(m), np.zeros(m)
+        memory = np.zeros(self.memory)
         noise, errors = rng.standard_normal((T, n)), rng.standard_normal((T, m))
         first = np.array(self.start)
         s = first[:, 0] + first[:, 1] * noise[0]
@@ -97,7 +115,12 @@ class System:
             else:
                 wide = np.where(rng.random(m) < wild, WILD, 1.0)
                 Y[t] = level + spread * wide * errors[t]
+            if self.resolution:
+                Y[t] = np.round(Y[t] / self.resolution) * self.resolution
+            if self.control is not None:
+                U[t] = self.control(Y[t], excited[t], memory)
+                V[t] = driven(U[: t + 1], e)[t]  # effects on the input look back, never ahead
             if t + 1 < T:
                 self.step(s, V[t], t + 1, p, e, mean, sd)
                 s = mean + sd * noise[t + 1]
-        return X, Y
+        return U, X, Y
