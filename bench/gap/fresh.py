@@ -27,7 +27,7 @@ import pandas as pd
 import ssmppl as ssm
 from bench.gap.filter import terms
 from bench.gap.fit import fit
-from bench.gap.plan import SPLIT, entries
+from bench.gap.plan import CELLS, SPLIT, entries
 from bench.gap.records import CACHE, Record
 from bench.gap.run import SETS
 from bench.gap.score import opened, records
@@ -139,7 +139,7 @@ def of_record(record: Record, answer: dict) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--half", choices=list(SPLIT["halves"]))
-    parser.add_argument("--cell", choices=list(SPLIT["cells"]))
+    parser.add_argument("--cell", choices=CELLS)
     parser.add_argument("--method", default="diagnose")
     options = parser.parse_args()
     path = CACHE / "fresh.json"
@@ -151,6 +151,8 @@ def main() -> None:
     for entry in entries():
         record = kept.get(entry.id)
         wanted = options.half in (None, entry.half) and options.cell in (None, entry.cell)
+        if entry.system not in SYSTEMS:  # the arm has no filter of its own
+            continue
         if not wanted or not entry.effects or record is None or not record.model_text:
             continue
         if mine.get(entry.id, {}).get("digest") == record.digest:

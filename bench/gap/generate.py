@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.gap import arm
 from bench.gap.names import ITEMS
 from bench.gap.plan import SPLIT, Entry, entries
 from bench.gap.sealing import digest, seal
@@ -41,6 +42,9 @@ def made(entry: Entry, table: dict[str, dict]) -> tuple[str, str, dict]:
     ------
     KeyError : the strength of one of its effects is not solved.
     """
+    if entry.system == arm.NAME:
+        data, parameters, strengths = arm.made(entry.seed, entry.effects)
+        return data, model_text(entry), answer_of(entry, parameters, strengths)
     system = SYSTEMS[entry.system]
     chosen = {
         key: strength_of(table, system.name, key, entry.level)
@@ -51,17 +55,22 @@ def made(entry: Entry, table: dict[str, dict]) -> tuple[str, str, dict]:
     U, _, Y = system.recorded(p, e, system.excite(rng, system.steps), rng)
     if not np.isfinite(Y).all():
         raise ValueError(f"{entry.id}: the true system {system.name} left the numbers")
-    answer = {
+    parameters = dict(zip(system.parameters, told(entry, p), strict=True))
+    return data_text(system, U, Y), model_text(entry), answer_of(entry, parameters, chosen)
+
+
+def answer_of(entry: Entry, parameters: dict[str, float], strengths: dict[str, float]) -> dict:
+    """The answer that is sealed."""
+    return {
         "id": entry.id,
         "half": entry.half,
         "cell": entry.cell,
-        "system": system.name,
+        "system": entry.system,
         "level": entry.level,
         "seed": entry.seed,
-        "parameters": dict(zip(system.parameters, told(entry, p), strict=True)),
-        "effects": [described(entry.system, key, chosen[key]) for key in entry.effects],
+        "parameters": parameters,
+        "effects": [described(entry.system, key, strengths[key]) for key in entry.effects],
     }
-    return data_text(system, U, Y), model_text(entry), answer
 
 
 def told(entry: Entry, p: np.ndarray) -> list[float]:
@@ -71,7 +80,7 @@ def told(entry: Entry, p: np.ndarray) -> list[float]:
 
 def described(system: str, key: str, strength: float) -> dict:
     """One effect of an answer: `names` count as right, none of them for one outside."""
-    effect = SYSTEMS[system].effects[key]
+    effect = arm.EFFECTS[key] if system == arm.NAME else SYSTEMS[system].effects[key]
     return {
         "key": key,
         "strength": strength,

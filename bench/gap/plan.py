@@ -17,11 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.gap import arm
 from bench.gap.truth import SYSTEMS
 
 SPLIT = json.loads((Path(__file__).parent / "split.json").read_text())
 ONE, TWO, OUTSIDE = ("one-20", "one-50"), "two-50", "outside-50"
 NONE = ("none", "none-start", "none-noise")
+CELLS = (*SPLIT["cells"], arm.CELL, arm.CELL_NONE)
 # Effects that no strength brings to 50 nats: the stronger they are the less moves that shows them.
 UNREACHABLE: frozenset[str] = frozenset(
     {
@@ -37,7 +39,8 @@ UNREACHABLE: frozenset[str] = frozenset(
 
 @dataclass(frozen=True)
 class Entry:
-    """One data set: `effects` are keys of its system's effects, `level` the nats of each."""
+    """One data set: `effects` are keys of its system's effects, `level` the nats of each (0 where
+    they are not solved for)."""
 
     id: str
     half: str
@@ -79,9 +82,23 @@ def entries() -> tuple[Entry, ...]:
             made.append(
                 Entry(f"{half[0]}{number:03d}", half, cell, name, effects, level, int(seed))
             )
+    made += _arms()
     chosen = _ci(made)
     marked = [replace(e, ci=e.id in chosen) for e in made]
     return tuple(sorted(marked, key=lambda e: e.id))
+
+
+def _arms() -> list[Entry]:
+    """The sets of the arm in MuJoCo, which no cell of the systems has."""
+    what = SPLIT["arm"]
+    drawn = [(arm.CELL, held) for held in arm.turns(what[arm.CELL])]
+    drawn += [(arm.CELL_NONE, ())] * what[arm.CELL_NONE]
+    rng = np.random.default_rng(what["seed"])
+    ids, seeds = rng.permutation(len(drawn)), rng.integers(2**31, size=len(drawn))
+    return [
+        Entry(f"a{number:03d}", what["half"], cell, arm.NAME, effects, 0, int(seed))
+        for (cell, effects), number, seed in zip(drawn, ids, seeds, strict=True)
+    ]
 
 
 def _turns(name: str, cell: str, seed: int) -> Iterator[tuple[str, ...]]:

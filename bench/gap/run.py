@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import ssmppl as ssm
-from bench.gap.plan import SPLIT, entries
+from bench.gap.plan import CELLS, SPLIT, entries
 from bench.gap.records import Record, from_report, keep, parse, path_of
 from bench.gap.sealing import digest, file_digest
 from ssmppl.modelfile import load_model, read_csv
@@ -93,7 +93,7 @@ def _before(stop: float, id: str, mode: str, method: str) -> Record | None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--half", choices=list(SPLIT["halves"]))
-    parser.add_argument("--cell", choices=list(SPLIT["cells"]))
+    parser.add_argument("--cell", choices=CELLS)
     parser.add_argument("--subset", choices=["ci"])
     parser.add_argument("--ids", nargs="*")
     parser.add_argument("--mode", default="full", choices=["full", "fast"])

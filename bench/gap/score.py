@@ -191,6 +191,10 @@ def measures(method: str, scored: Sequence[Scored], fresh: Shares | None = None)
         median("F of a wrong one, 20 nats", method,
                (s.share(False) for s in of("one-20")), "<= 0.05"),
         rate("interval covers F*", method, covers(ones, fresh or {}), "in 0.90-0.98"),
+        rate("right effect first, arm", method, (s.right_first for s in of("arm")), ""),
+        rate("its class first, arm", method, (s.right_class for s in of("arm")), ""),
+        rate("right equation, arm", method, (s.right_equation for s in of("arm")), ""),
+        rate("false alarm, arm-none", method, map(detected, of("arm-none")), ""),
         rate("failed", method, (bool(s.record.failed) for s in scored), "<= 0"),
         median("seconds", method, (s.record.seconds for s in scored), ""),
     ]  # fmt: skip
@@ -201,13 +205,13 @@ SPLIT_INSIDE = ("one-20", "one-50", "two-50")
 
 
 def by_system(scored: Sequence[Scored]) -> str:
-    """Sets with one effect, both levels together, system by system: a table of hits."""
+    """Sets with one effect, all levels together, system by system: a table of hits."""
     tests: dict[str, Callable[[Scored], bool]] = {
         "first": lambda s: s.right_first, "class first": lambda s: s.right_class,
         "equation": lambda s: s.right_equation, "none of these, falsely": says_none,
         "not detected": lambda s: not detected(s),
     }  # fmt: skip
-    ones = [s for s in scored if s.cell in ("one-20", "one-50")]
+    ones = [s for s in scored if s.cell in ("one-20", "one-50", "arm")]
     lines = ["| system | sets | " + " | ".join(tests) + " |", "|---" * (len(tests) + 2) + "|"]
     for name in dict.fromkeys(s.answer["system"] for s in ones):
         own = [s for s in ones if s.answer["system"] == name]

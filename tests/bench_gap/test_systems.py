@@ -7,7 +7,7 @@ from bench.gap.names import ITEMS
 from bench.gap.plan import SPLIT
 from bench.gap.run import MODELS
 from bench.gap.truth import SYSTEMS
-from bench.gap.truth.forms import SLOTS, delayed, driven, lagged, play
+from bench.gap.truth.forms import DELAY, SLOTS, delayed, driven, lagged, play
 from ssmppl.diagnosis.effects.catalogue import effects
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.model.trace import previous
@@ -101,7 +101,8 @@ def test_a_closed_loop_commands_what_the_encoder_told():
     assert np.abs(Y[:, 0] - excited[:, 0])[100:].max() < 0.1  # it follows
     counts = Y / system.resolution
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
-    late = system.strengths({"delay": 3.0})
+    late = system.strengths({})
+    late[DELAY] = 3.0
     V, _, _ = system.recorded(p, late, excited, np.random.default_rng(1))
     assert np.abs(U - V).max() > 0.01  # the loop answers to what delays it
     np.testing.assert_array_equal(excited, system.excite(np.random.default_rng(0), system.steps))

@@ -25,7 +25,7 @@ def rate(x, v, z, u, t, p, e):
     """Acceleration: z is the bristle's deflection."""
     drive = p[0] * (1 - e[f.DRIFT] * f.logistic((t / STEPS - 0.5) * 8))
     push = drive * u[0] - p[1] * v
-    push -= (e[f.COULOMB] + e[f.STRIBECK]) * z
+    push -= (e[f.COULOMB] + e[f.STRIBECK] + e[f.LOAD_FRICTION] * abs(u[0]) ** 0.9) * z
     push -= e[f.ASYMMETRIC] * 0.03 * f.softplus(v / 0.03)
     return push + e[f.OUTSIDE] * np.sin(2 * np.pi * x / 0.012) * u[0]
 
@@ -35,7 +35,7 @@ def step(s, u, t, p, e, mean, sd):
     x, v, z = s[0], s[1], s[2]
     h = DT / SUBSTEPS
     for _ in range(SUBSTEPS):
-        if e[f.COULOMB] != 0:
+        if e[f.COULOMB] != 0 or e[f.LOAD_FRICTION] != 0:
             z = f.bristle(z, v, h, 0.0004, 1.0)
         elif e[f.STRIBECK] != 0:
             z = f.bristle(z, v, h, 0.0004, 0.4 + 1 / (1 + (v / 0.03) ** 2))
@@ -85,7 +85,7 @@ SYSTEM = System(
         "asymmetric": Effect("asymmetric", "asymmetric friction", ("v",), 0.05),
         "dead zone": Effect("dead_zone", "dead zone", ("u",), 0.0007),
         "saturation": Effect("saturation", "input saturation", ("u",), 0.15),
-        "delay": Effect("delay", "input delay", ("u",), 0.007),
+        "load friction": Effect("load_friction", "load-dependent friction", ("v",), 0.05),
         "drift": Effect("drift", "parameter drift", ("b",), 0.001),
         "gain": Effect("gain", "sensor gain nonlinearity", ("y",), 0.4),
         "spindle": Effect("outside", None, ("v",), 0.08),
