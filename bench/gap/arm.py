@@ -1,9 +1,9 @@
 """A two-link arm in MuJoCo, beside the true systems: data sets whose model calls an engine.
 
-The real arm is the model's own file with one thing more, stepped here by MuJoCo itself: dry friction
-in the elbow, a stop of the elbow either way, a drag of the elbow that grows with the square of its
-speed, or motors that act late. It is no `System`: it has no filter of its own, so that strengths are
-drawn between bounds set by hand, and how many nats they are worth is not solved. Its sets stand in
+The real arm is the model's own file with one thing more, stepped here by MuJoCo itself: dry
+friction in the elbow, a stop of the elbow either way, a drag of the elbow by the square of its
+speed, or motors that act late. It is no `System` and has no filter of its own: strengths are drawn
+between bounds set by hand, and how many nats they are worth is not solved. Its sets stand in
 cells of their own, `arm` and `arm-none`, and the rivals that need a filter leave them out.
 """
 

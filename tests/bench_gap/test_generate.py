@@ -17,12 +17,12 @@ from bench.gap.plan import NONE, SPLIT, UNREACHABLE, entries
 from bench.gap.records import Record
 from bench.gap.sealing import digest, seal, unseal
 from bench.gap.truth import SYSTEMS
-
-SOLVED = [e for e in entries() if e.system in SYSTEMS]  # all but those of the arm: see test_arm
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 from tests.bench_gap import made_up
+
+SOLVED = [e for e in entries() if e.system in SYSTEMS]  # all but those of the arm: see test_arm
 
 
 def guessed():

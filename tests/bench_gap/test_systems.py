@@ -14,7 +14,6 @@ from ssmppl.language.model.trace import previous
 from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 
-
 # Models that integrate over a row: the true systems integrate more finely, and differ by the error
 # of the models' steps, of which `test_what_the_models_steps_leave_is_far_below_the_noise` tells.
 FINER = {"servo": 1e-8, "swing": 1e-5}
@@ -93,7 +92,7 @@ def test_a_closed_loop_commands_what_the_encoder_told():
     system = SYSTEMS["servo"]
     p = np.array(list(system.parameters.values()))
     excited = system.excite(np.random.default_rng(0), system.steps)
-    U, X, Y = system.recorded(p, system.strengths({}), excited, np.random.default_rng(1))
+    U, _, Y = system.recorded(p, system.strengths({}), excited, np.random.default_rng(1))
     memory = np.zeros(system.memory)
     again = [system.control(y, w, memory) for y, w in zip(Y, excited, strict=True)]
     np.testing.assert_array_equal(U, again)

@@ -14,15 +14,16 @@ from bench.gap.truth.system import Effect, System
 
 STEPS = 200
 ROOM = 21.0
+SHARE = 0.5  # the heater's heat per degree over the plate's
 
 
 @njit
 def step(s, u, t, p, e, mean, sd):
     a, c, z1, z2 = s[0], s[1], s[2], s[3]
-    g, m, h, b, q = p[0], p[1], p[2], p[3], p[4]
+    g, h, b, q = p[0], p[1], p[2], p[3]
     open_ = h * (1 + e[f.BREAK] * f.logistic((t - 0.4 * STEPS) / 2))
     over = c - ROOM
-    gain = m * (a - c) - open_ * over
+    gain = SHARE * g * (a - c) - open_ * over
     gain -= e[f.LOSS] * (f.signed_power(over, 2.3) / 60 - over)
     gain -= e[f.LOAD] * (1 + 0.05 * np.tanh(over / 10 - 2))
     gain /= 1 + abs(e[f.OUTSIDE]) * np.exp(-(((c - 42.0) / 5.0) ** 2))  # more heat per degree
@@ -39,7 +40,7 @@ def step(s, u, t, p, e, mean, sd):
 @njit
 def observe(s, u, t, p, e, mean, sd, wild):
     mean[0] = s[1] - e[f.CLIPPING] * 2.0 * f.softplus((s[1] - 44.0) / 2.0)
-    sd[0] = p[5]
+    sd[0] = p[4]
 
 
 def excite(rng, T):
@@ -55,7 +56,7 @@ def excite(rng, T):
 SYSTEM = System(
     "hot_plate",
     STEPS,
-    {"g": 0.12, "m": 0.06, "h": 0.04, "b": 3.0, "q": 0.04, "r": 0.025},
+    {"g": 0.12, "h": 0.04, "b": 3.0, "q": 0.04, "r": 0.025},
     ("u",),
     ("y",),
     ("heater", "plate", "missing heat", "its rate"),
