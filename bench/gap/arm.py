@@ -37,10 +37,10 @@ class ArmEffect:
 
 
 EFFECTS = {
-    "friction": ArmEffect("coulomb friction", ("v2",), 0.03, 0.10),  # N m
-    "stop": ArmEffect("hard stop", ("v2",), 60.0, 80.0),  # degrees
-    "drag": ArmEffect("quadratic drag", ("v2",), 0.01, 0.03),  # N m s^2
-    "delay": ArmEffect("input delay", ("u1", "u2"), 1.0, 3.0),  # rows
+    "friction": ArmEffect("coulomb friction", ("v2",), 0.02, 0.08),  # N m
+    "stop": ArmEffect("hard stop", ("v2",), 70.0, 90.0),  # degrees
+    "drag": ArmEffect("quadratic drag", ("v2",), 0.0005, 0.003),  # N m s^2
+    "delay": ArmEffect("input delay", ("u1", "u2"), 0.2, 1.0),  # rows
 }
 
 

@@ -61,7 +61,7 @@ def test_every_effect_changes_what_is_read():
         for strength in (effect.weakest, effect.strongest):
             Y = arm.simulate(NOMINAL, key, strength, asked, None)
             assert np.isfinite(Y).all()
-            assert np.abs(Y - plain).max() > 0.02, key
+            assert np.abs(Y - plain).max() > 5 * arm.PARAMETERS["r"], key
 
 
 def test_a_set_is_the_same_every_time_and_its_answer_says_what_is_in_it():

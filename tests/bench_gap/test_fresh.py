@@ -47,6 +47,34 @@ def test_fresh_runs_are_of_the_sets_own_system():
     np.testing.assert_array_equal(one, other)
 
 
+def test_a_closed_loop_runs_again_with_the_same_references_and_commands_of_its_own():
+    system = SYSTEMS["servo"]
+    rng = np.random.default_rng(8)
+    p = system.drawn_parameters(rng)
+    excited = system.excite(rng, system.steps)
+    U, _, Y = system.recorded(p, system.strengths({}), excited, rng)
+    data = pd.DataFrame(np.hstack([U, Y]), columns=[*system.inputs, *system.channels])
+    answer = {
+        "parameters": dict(zip(system.parameters, p.tolist(), strict=True)),
+        "effects": [],
+        "seed": 8,
+    }
+    seen = []
+
+    def rows(frame, repeats):
+        seen.append(arrays(system, frame))
+        return np.zeros((repeats, len(frame)))
+
+    share(rows, rows, rows, system, answer, data)
+    fresh = seen[3:]
+    assert len(fresh) == 60
+    for V, Z in fresh:
+        memory = np.zeros(system.memory)
+        again = [system.control(y, w, memory) for y, w in zip(Z, excited, strict=True)]
+        np.testing.assert_array_equal(V, again)
+        assert np.abs(V - U).max() > 0
+
+
 @pytest.mark.slow
 def test_the_true_model_closes_all_and_the_base_nothing(case):
     data, answer, base, true = case

@@ -101,6 +101,19 @@ def test_none_of_these_is_right_outside_and_wrong_inside():
     assert found["none of these falsely said"].value == 0.5
 
 
+def test_the_arm_has_rows_of_its_own():
+    found = values(
+        scored("arm", RIGHT, causes=CAUSES[1:]),
+        scored("arm", RIGHT, causes=CAUSES),
+        scored("arm-none", causes=CAUSES),
+    )
+    assert found["right effect first, arm"].value == 0.5
+    assert found["its class first, arm"].value == 1
+    assert found["right equation, arm"].value == 1
+    assert found["false alarm, arm-none"].value == 1
+    assert found["false alarm"].sets == found["right effect first, 20 nats"].sets == 0
+
+
 def test_both_of_two_need_both():
     truth = (RIGHT, (["dead zone"], ["u"]))
     found = values(

@@ -1,8 +1,9 @@
 """Every effect on every model there is: what the tests of one effect after another go through.
 
-The models are those of the tests, of the gallery (`examples`), of the benchmark and of users
-(`cases`); the effects those that a model is offered, the first shape of each. A triple is a model,
-an effect that is in it, and another one that is added.
+The models are those of the tests, of the gallery (`examples`), of the benchmark (but for its sealed
+half, by which nothing is to be tuned before it is opened) and of users (`cases`); the effects those
+that a model is offered, the first shape of each. A triple is a model, an effect that is in it, and
+another one that is added.
 """
 
 import functools
@@ -13,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.gap import arm
+from bench.gap.plan import SPLIT
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.diagnosis.model.augment import augment, with_given_parameters
@@ -30,10 +33,12 @@ from tests.diagnosis import harness
 ROOT = Path(__file__).parent.parent.parent
 FOLDERS = {"example": "examples/*/model.py", "bench": "bench/gap/systems/*.py",
            "case": "tests/diagnosis/cases/[a-z]*.py"}  # fmt: skip
+SEALED = {*SPLIT["halves"]["sealed"]["systems"], arm.NAME}
 FILES = {
     (where, p.parent.name if where == "example" else p.stem): p
     for where, pattern in FOLDERS.items()
     for p in sorted(ROOT.glob(pattern))
+    if where != "bench" or p.stem not in SEALED
 }
 MODELS = [*harness.EVERY, *FILES]
 LAWS = ("initial", "transition", "observations")
