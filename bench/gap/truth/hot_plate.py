@@ -44,8 +44,8 @@ def observe(s, u, t, p, e, mean, sd, wild):
 
 
 def excite(rng, T):
-    """The plan of a step test: off at first, then levels in an order that is the same for all, since
-    with so few steps another order makes another set; each for a random time and 5% off."""
+    """The plan of a step test: off at first, then levels in an order that is the same for all sets,
+    since with so few steps their gains would be far apart; each for a random time and 5% off."""
     out, t = np.zeros(T), int(rng.integers(5, 16))
     for level in (0.7, 1.1, 0.3, 0.9, 0.2, 0.5):
         out[t:] = level * np.exp(0.05 * rng.standard_normal())
