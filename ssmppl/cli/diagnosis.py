@@ -69,6 +69,11 @@ def _made(folder: Path) -> Path:
     help="Chance of naming an effect if the model is right, over all that are tried; of reporting "
     "any finding about 1.4 times this, in fast mode 1.6.",
 )  # fmt: skip
+@option(
+    "--horizon", type=click.IntRange(1), metavar="ROWS",
+    help="Rows of the simulations by which the report says how far the gap closes [default: a "
+    "tenth of the longest record].",
+)  # fmt: skip
 @option("--seed", type=int, default=1, section="Run", help="Of all random numbers.")
 @option(
     "--checkpoint", type=click.Path(path_type=Path), metavar="PATH", section="Run",
@@ -83,7 +88,7 @@ def _made(folder: Path) -> Path:
 def diagnose(
     model: str, data: tuple[Path, ...], output: Path | None, mode: str, fast: bool,
     fixed: tuple[str, ...], effects: str | None, particles: int | None, alpha: float,
-    seed: int, checkpoint: Path | None, debug: bool, progress: bool,
+    horizon: int | None, seed: int, checkpoint: Path | None, debug: bool, progress: bool,
 ) -> None:  # fmt: skip
     """Where MODEL.py differs from DATA, which effect is missing, how far the gap closes.
 
@@ -107,6 +112,7 @@ def diagnose(
         report: GapReport = ssm.diagnose(
             loaded, read, names, mode="fast" if fast else mode, alpha=alpha, fixed=held or None,
             particles=particles, checkpoint=kept, progress=progress, seed=seed, debug=debug,
+            horizon=horizon,
         )  # fmt: skip
     except KeyboardInterrupt:
         stop_interrupted(f"before there was anything to report. {kept} holds the stages that are "

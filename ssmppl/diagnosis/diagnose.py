@@ -79,6 +79,7 @@ def diagnose(
     progress: bool = True,
     seed: int | None = 1,
     debug: bool = False,
+    horizon: int | None = None,
 ) -> GapReport:
     """Find where a model differs from reality, and which effect that it lacks causes this.
 
@@ -108,6 +109,9 @@ def diagnose(
     seed : the same seed gives the same report.
     debug : the first internal error is raised, where else the part that it ended (a
         candidate, a refit, a block, a table) is left out: see `GapReport.left_out`.
+    horizon : rows of the simulations by which the report says how far the gap closes: from the
+        filtered state of one row on, so many rows without looking at the data. None: a tenth of the
+        longest record.
 
     Returns
     -------
@@ -124,10 +128,12 @@ def diagnose(
     check_number("alpha", alpha, lambda v: 0.0 < v < 0.5, "give an error rate such as 0.05")
     if particles is not None:
         check_count("particles", particles, 10)
+    if horizon is not None:
+        check_count("horizon", horizon, 1)
     check_executor(executor)
     return _Diagnosis(
         model, data, effects, mode, alpha, fixed, particles, executor, checkpoint, progress, seed,
-        Failures(debug),
+        Failures(debug), horizon,
     ).run()  # fmt: skip
 
 
@@ -138,9 +144,9 @@ class _Diagnosis:
         self, model: Model, data: Any, effects: Chosen, mode: str, alpha: float,
         fixed: Mapping[str, Any] | None, particles: int | None, executor: Executor | None,
         checkpoint: str | os.PathLike[str] | None, progress: bool, seed: int | None,
-        failures: Failures,
+        failures: Failures, horizon: int | None,
     ):  # fmt: skip
-        self.failures = failures
+        self.failures, self.horizon = failures, horizon
         self.began = time.perf_counter()
         self.problem = pose(model, data)
         self.trace = self.problem.trace
@@ -171,7 +177,7 @@ class _Diagnosis:
         self.notes += [BY_EXTENDED] * self.called
         described = {
             "alpha": alpha, "seed": self.root.entropy, "fixed": self.fixed, "particles": number,
-            "sets": self.sets,
+            "sets": self.sets, "horizon": horizon,
         }  # fmt: skip
         made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
         # Threads that wait for one simulator take turns, which takes longer than one alone.
@@ -247,7 +253,7 @@ class _Diagnosis:
         with self.failures.guard("the choice of an effect"):
             EffectSelection(
                 self.augmented, r.screen, r.screen.experiments, self._seed(Stage.SELECTION),
-                self.alpha, self.checkpoint,
+                self.alpha, self.checkpoint, horizon=self.horizon,
             ).run(found)  # fmt: skip
         r.selection, r.fit = found, found.base
         if found.unfitted is not None:  # nothing to measure, then
@@ -302,9 +308,11 @@ class _Diagnosis:
         once = r.chosen is not None and any(is_pulse(c) for c in r.chosen.candidates)
         if self.split and not once:
             best = r.refits[0] if r.refits else None
+            simulation = r.selection.simulation if r.selection else None
             return HeldOutRows(
-                self.augmented, self.split, (r.base, r.fit), r.screen, r.chosen, best
-            ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)
+                self.augmented, self.split, (r.base, r.fit), r.screen, r.chosen, best, r.simulator,
+                simulation, self.horizon,
+            ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)  # fmt: skip
         r.blocks = self.folds
         augmented, design, base = self.augmented, r.screen.design, (r.base, r.fit)
         if self.split:  # the code so far knows no missing rows
@@ -320,8 +328,9 @@ class _Diagnosis:
             base = fitter, fitter.restored(self.experiments, r.fit.numbers)
         whole = None if self.split or (r.selection and r.selection.rebased) else r.screen
         return CrossValidation(
-            augmented, design, base, self.experiments, self.alpha, r.chosen, whole
-        ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)
+            augmented, design, base, self.experiments, self.alpha, r.chosen, whole, r.simulator,
+            self.horizon,
+        ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)  # fmt: skip
 
     def _separating_input(self, r: Results) -> None:
         """The input that would separate the class of the best, where there is a class."""

@@ -47,6 +47,7 @@ def observation(x):
 
 def effect_found():
     """One effect, one rival it cannot be told from, refits, a curve and a free run."""
+    kinds = {"outliers": "noise law", "heteroscedastic noise": "noise law"}
     causes = [
         ("quadratic drag", "", "v", 6.2, 0.0004, 19.2, 24.3, 1, ">= 0", 0.3124, 0.0413),
         ("state-dependent damping", "−λ x² v", "v", 5.9, 0.0007, 17.4, 22.9, 1, ">= 0", 0.21, 0.03),
@@ -75,6 +76,12 @@ def effect_found():
     ]
     fields = ("effect", "F", "F_low", "F_high", "nats_per_sample", "gain_mean", "gain_noise",
               "rmse_before", "rmse_after")  # fmt: skip
+    by_horizon = [
+        ("1", 0.052, 0.051, 0.02, -0.01, 0.05, 0.08),
+        ("10", 0.101, 0.062, 0.386, 0.3, 0.46, 0.31),
+        ("1 to 100", 0.208, 0.091, 0.5625, 0.48, 0.63, 0.92),
+    ]
+    ahead = ("horizon", "rmse_before", "rmse_after", "share", "low", "high", "nats_per_sample")
     t, observed, before, after = oscillation(1000)
     v = np.linspace(-2.4, 2.4, 41)
     band = 0.03 + 0.04 * (v / 2) ** 2
@@ -86,12 +93,18 @@ def effect_found():
                  z=6.13, p=0.0004),
             dict(equation="y", moment="scale", t_from=1, t_to=1000, region="", z=2.1, p=0.31),
         ]),
-        causes=tabulate("causes", [dict(zip(names, row, strict=True)) for row in causes]),
+        causes=tabulate("causes", [
+            dict(zip(names, row, strict=True), kind=kinds.get(row[0], "mechanism"))
+            for row in causes
+        ]),
         classes=tabulate("classes", [
             dict(class_id=i, effect=e, equation=q, rho=r, separating_input=s)
             for i, e, q, r, s in classes
         ]),
-        closed=tabulate("closed", [dict(zip(fields, row, strict=True)) for row in closed]),
+        closed=tabulate("closed", [
+            *(dict(zip(fields, row, strict=True), horizon="free run") for row in closed),
+            *(dict(zip(ahead, row, strict=True), effect="quadratic drag") for row in by_horizon),
+        ]),
         detection=tabulate("detection", [
             dict(channel="y", statistic=s, value=x, z=z, p=p)
             for s, x, z, p in (("mean", 0.02, 0.4, 0.99), ("variance", 1.06, 1.1, 0.8),
@@ -227,7 +240,7 @@ def break_of_level():
     runs = {"1": (years, {"flow": (observed, np.full(100, 919.0), level)})}
     causes = [dict(effect="parameter break", form="from 1899 on", equation="level", z=5.1, p=0.0007,
                    gain_screen=13.0, gain_refit=14.2, class_id=1, sign="±", estimate=-247.8,
-                   se=28.1)]  # fmt: skip
+                   se=28.1, kind="change in time")]  # fmt: skip
     return dataclasses.replace(
         found, chosen=["parameter break"], missing=None, parts={"cross-fitting": 10},
         where=tabulate("where", [dict(equation="level", moment="mean", t_from=1898, t_to=1899,

@@ -74,8 +74,8 @@ def run(*args, code=0):
 
 def test_everything_given_is_handed_on(calls, tmp_path):
     run("walk.py", "series.csv", "-o", "out", "--fast", "--fixed", "q=0.5", "r=1", "--effects",
-        "coulomb friction, quadratic drag", "--particles", 500, "--alpha", 0.01, "--seed",
-        7)  # fmt: skip
+        "coulomb friction, quadratic drag", "--particles", 500, "--alpha", 0.01, "--horizon",
+        40, "--seed", 7)  # fmt: skip
     ((model, data, effects, keywords),) = calls
     assert model.name == "walk"
     assert list(data["y"]) == [0, 1, 2, 3]
@@ -83,7 +83,8 @@ def test_everything_given_is_handed_on(calls, tmp_path):
     checkpoint = keywords.pop("checkpoint")
     assert checkpoint.resolve().parent == tmp_path / "out"
     assert keywords == {"mode": "fast", "alpha": 0.01, "fixed": {"q": 0.5, "r": 1.0},
-                        "particles": 500, "progress": True, "seed": 7, "debug": False}  # fmt: skip
+                        "particles": 500, "progress": True, "seed": 7, "debug": False,
+                        "horizon": 40}  # fmt: skip
 
 
 def test_the_words_are_printed_and_the_folder_is_written(calls, tmp_path):

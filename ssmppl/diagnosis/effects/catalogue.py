@@ -31,6 +31,7 @@ class Catalogue:
     numbers = staticmethod(effect.numbers)
     sds = staticmethod(effect.sds)
     means = staticmethod(effect.means)
+    firsts = staticmethod(effect.firsts)
     quantiles = staticmethod(effect.quantiles)
     sizes = staticmethod(effect.sizes)
     rows = staticmethod(effect.rows)

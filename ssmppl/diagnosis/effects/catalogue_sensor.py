@@ -14,6 +14,7 @@ from ssmppl.diagnosis.effects.effect import (
     Auxiliary,
     declared,
     effect,
+    firsts,
     means,
     numbers,
     quantiles,
@@ -80,7 +81,7 @@ def sensor_rectification(h, strength):
 
 
 @effect(on="channel", kind="state", name="sensor lag", lower=0, upper=2, states=("sensed",),
-        shapes={"k": numbers(2, 5, between=(1.0, 30.0)), "start": means(1.0)})  # fmt: skip
+        shapes={"k": numbers(2, 5, between=(1.0, 30.0)), "start": firsts(1.0)})  # fmt: skip
 def sensor_lag(h, sensed, strength, k, start):
     """l (s - h), s following h with the time constant of k rows"""
     return Auxiliary(strength * (sensed - h), {"sensed": Dirac(sensed + (h - sensed) / k)},
@@ -89,7 +90,7 @@ def sensor_lag(h, sensed, strength, k, start):
 
 @effect(on="channel", kind="state", name="sensor delay", lower=0, upper=2,
         states={"earlier": "delay"},
-        shapes={"delay": numbers(1, 3), "start": means(1.0)})  # fmt: skip
+        shapes={"delay": numbers(1, 3), "start": firsts(1.0)})  # fmt: skip
 def sensor_delay(h, earlier, strength, delay, start):
     """l (h_{t - delay} - h_t)"""
     newest_first = np.stack([h, *earlier[:-1]])

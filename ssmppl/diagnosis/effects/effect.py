@@ -77,6 +77,14 @@ ON = ("any", "rate", "state", "channel", "input", "parameter", "positive paramet
 REQUIRES = ("positive", "both signs")
 PROCESSES = ("random walk", "ar1")  # of zero mean: their score in `strength` is zero
 
+# What naming an effect says: a function of states, inputs and their past, with few numbers; a
+# function of time, which cannot carry to another record; a latent process, which fits any misfit of
+# a mean for as long as it remembers; a law of the noise.
+MECHANISM, CHANGE_IN_TIME = "mechanism", "change in time"
+UNKNOWN_INPUT, NOISE_LAW = "unknown input", "noise law"
+CAUSES = (MECHANISM, CHANGE_IN_TIME, UNKNOWN_INPUT, NOISE_LAW)
+ASKED = {MECHANISM: 0, CHANGE_IN_TIME: 1, UNKNOWN_INPUT: 1, NOISE_LAW: 2}  # the lowest first
+
 # Functions of time by name: of t and of shape parameters.
 PROFILES: dict[str, Callable[..., Any]] = {
     "drift": lambda t, rows: t / rows - 0.5,
@@ -90,8 +98,9 @@ PROFILES: dict[str, Callable[..., Any]] = {
 class Grid:
     """The values of a shape parameter, relative to a scale that binding turns into numbers.
 
-    unit : "number"; "sd" or "mean" (multiples of them), "quantile" (levels) or "size" (levels of
-        absolute values) of the variable; "rows" (shares of the number of rows, rounded).
+    unit : "number"; "sd", "mean" or "first" (multiples of them; the first value that was measured),
+        "quantile" (levels) or "size" (levels of absolute values) of the variable; "rows" (shares of
+        the number of rows, rounded).
     of : the argument whose variable is meant; "" is the first.
     between : bounds in the same unit, between which refits estimate the parameter; None: it stays
         at a value of the grid.
@@ -143,6 +152,7 @@ def _relative(name: str, unit: str, what: str) -> Callable[..., Grid]:
 
 sds = _relative("sds", "sd", "Multiples of the variable's standard deviation")
 means = _relative("means", "mean", "Multiples of the variable's mean")
+firsts = _relative("firsts", "first", "Multiples of the variable's first value")
 quantiles = _relative("quantiles", "quantile", "Quantiles of the variable, by their levels")
 sizes = _relative("sizes", "size", "Quantiles of the variable's absolute value, by their levels")
 
@@ -216,6 +226,15 @@ class Effect:
         shapes = {k: g if isinstance(g, Grid) else numbers(*g) for k, g in self.shapes.items()}
         object.__setattr__(self, "shapes", shapes)
         check(self)
+
+    @property
+    def cause(self) -> str:
+        """What naming it says, one of `CAUSES`."""
+        if self.kind in ("noise", "tail"):
+            return NOISE_LAW
+        if self.process:
+            return UNKNOWN_INPUT
+        return CHANGE_IN_TIME if self.profile or self.kind == "initial" else MECHANISM
 
     @property
     def where(self) -> Location:

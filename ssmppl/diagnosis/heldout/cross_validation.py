@@ -26,6 +26,7 @@ from ssmppl.diagnosis.heldout.gain_ratio import FEWEST_BLOCKS, NOT_GIVEN, HeldOu
 from ssmppl.diagnosis.heldout.predictions import Predictions, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference
 from ssmppl.diagnosis.heldout.row_split import FOLDS, Fold, folds
+from ssmppl.diagnosis.heldout.simulation import compared, horizons, table_rows
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen, screen_part
@@ -44,12 +45,14 @@ FOLDS_CALLED, SINGLES_CALLED = FEWEST_BLOCKS, 2  # likewise, of a model that cal
 
 @dataclass(frozen=True)
 class _FoldModels:
-    """Fitter and fit of each model without a block. chosen : the effects, None without any."""
+    """Fitter and fit of each model without a block. chosen : the effects, None without any.
+    simulators : base model and model with effects as they are simulated."""
 
     base: tuple[Fitter, Fit]
     effect: tuple[Fitter, Fit]
     reference: tuple[Fitter, Fit]
     chosen: Refit | None
+    simulators: tuple[tuple[Fitter, Fit], tuple[Fitter, Fit]]
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,8 @@ class CrossValidation:
     design : of the screen. base : the model's fitter and its fit to all rows. alpha : family-wise
     error rate of the selection. chosen : on all rows; None: the reference stands for it. whole :
     the screen of all rows by that design, whose simulated sets serve all blocks; None: each block
-    has its own.
+    has its own. simulator : the base model as it is simulated; None: as it was fitted. horizon : as
+    of `HeldOutRows`.
     """
 
     augmented: AugmentedModels
@@ -69,11 +73,13 @@ class CrossValidation:
     alpha: float
     chosen: Refit | None
     whole: Screen | None = None
+    simulator: tuple[Fitter, Fit] | None = None
+    horizon: int | None = None
 
     def gain(self, label: str, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> HeldOutGain:
         """Share of the gap that is closed on the blocks left out."""
         out = HeldOutGain()
-        out.simulate(self.base, self.experiments, self.chosen, seed)
+        out.simulate(self.simulator or self.base, self.experiments, self.chosen, seed)
         fed_back = feeds_back(self.augmented.trace)
         number = FOLDS_CALLED if simulators(self.augmented.trace) else FOLDS
         blocks = folds(self.experiments, number, fed_back=fed_back)
@@ -82,7 +88,8 @@ class CrossValidation:
             name = f"block {k + 1} of {len(blocks)}"
             own, kept = child_seed(seed, Task.BLOCK, k), checkpoint.within(name)
             try:
-                return kept.computed("held out", partial(self._one, blocks[k], own, kept))
+                one = partial(self._one, blocks[k], blocks[0].left_out, own, kept)
+                return kept.computed("held out", one)
             except SSMError:  # a block that a model cannot predict is no block to leave out
                 raise
             except Exception as error:
@@ -110,6 +117,10 @@ class CrossValidation:
             label, ratio, ratio.gain.nats / float(rows), float(table["gain_mean"].sum()),
             (before, after), self.chosen is not None,
         )  # fmt: skip
+        if "ahead" in table:
+            which = horizons(self.experiments, blocks[0].left_out, self.horizon)
+            ahead = [table["ahead"][h].T for h in range(len(which))]
+            out.rows += table_rows(label, which, ahead, None)
         same = int(table["same"].sum()) if "same" in table else len(each)  # resumed from before
         if self.chosen is not None and same < len(each):
             out.notes.append(
@@ -118,8 +129,12 @@ class CrossValidation:
             )
         return out
 
-    def _one(self, fold: Fold, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> Numbers:
-        """Fit, select and predict: log densities of the block, and free-run errors."""
+    def _one(
+        self, fold: Fold, first: Sequence[np.ndarray], seed: np.random.SeedSequence,
+        checkpoint: Checkpoint,
+    ) -> Numbers:  # fmt: skip
+        """Fit, select and predict: log densities of the block, and errors of simulations; first :
+        the rows of the first block, by which the horizons of all are chosen."""
         models = self._models(fold, seed, checkpoint)
         counts, chosen = list(fold.left_out), models.chosen
         events = [c for c in (chosen.candidates if chosen else ()) if is_dated(c)]
@@ -137,7 +152,12 @@ class CrossValidation:
         out["rows"] = np.asarray(float(sum(measured)))
         inside = [i for i, m in enumerate(measured) if m]
         at = [self.experiments[i] for i in inside]
-        for name, model in (("before", models.base), ("after", models.effect)):
+        which = horizons(self.experiments, first, self.horizon)
+        ahead = compared(*models.simulators, self.experiments, counts, which, seed)
+        with np.errstate(all="ignore"):
+            out["ahead"] = np.array([v.mean(axis=0) if len(v) else np.full(3, np.nan)
+                                     for v in ahead])  # fmt: skip
+        for name, model in zip(("before", "after"), models.simulators, strict=True):
             runs = [free_run(*model, e, seed) for e in at]
             out[name] = np.asarray(rmse(runs, at, [counts[i] for i in inside]) if at else 0.0)
         return out
@@ -164,7 +184,7 @@ class CrossValidation:
             EffectSelection(
                 self.augmented, screen, fold.train, seed, self.alpha, checkpoint, always=True,
                 singles=SINGLES_CALLED if called else SINGLES, approximate=True,
-                most=len(self.chosen.candidates), further=not called,
+                most=len(self.chosen.candidates), further=not called, horizon=self.horizon,
             ).run(found)  # fmt: skip
         chosen = found.chosen
         reference = fit_reference(
@@ -174,7 +194,9 @@ class CrossValidation:
         effect = (fitter, fit) if self.chosen else reference
         if chosen is not None:
             effect = (chosen.fitter, chosen.fit)
-        return _FoldModels((fitter, fit), effect, reference, chosen)
+        before = found.simulating.model if found.simulating else (fitter, fit)
+        after = chosen.simulator if chosen else effect
+        return _FoldModels((fitter, fit), effect, reference, chosen, (before, after))
 
     def _predict(
         self, model: tuple[Fitter, Fit], events: Sequence[Candidate], fold: Fold,

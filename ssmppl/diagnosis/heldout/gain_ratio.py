@@ -21,11 +21,14 @@ from ssmppl.diagnosis.effects.candidate import WHOLE, segments
 from ssmppl.diagnosis.heldout.predictions import FreeRun, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference
 from ssmppl.diagnosis.heldout.row_split import RowSplit
+from ssmppl.diagnosis.heldout.simulation import FREE_RUN, compared, horizons, table_rows
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.diagnosis.selection.simulation_fit import fit_for_simulation
 from ssmppl.errors import ArgumentError, SSMError
 
 REPLICATES = 2000  # of the bootstrap
@@ -310,10 +313,13 @@ class HeldOutGain:
     """Rows of the report's table, free runs of each experiment before and after, and notes.
 
     beyond_catalogue : what the reference gains over the best of the catalogue, chosen or not.
+    simulated_beyond : by which share its simulations are better than those of what was chosen, and
+    the lower end of the interval; None where that was not measured.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     beyond_catalogue: Gain | None = None
+    simulated_beyond: tuple[float, float] | None = None
     before: list[FreeRun] = field(default_factory=list)
     after: list[FreeRun] | None = None
     notes: list[str] = field(default_factory=list)
@@ -322,10 +328,11 @@ class HeldOutGain:
         self, base: tuple[Fitter, Fit], experiments: Sequence[Experiment], chosen: Refit | None,
         seed: np.random.SeedSequence,
     ) -> None:  # fmt: skip
-        """Free runs of the model as it was and, where an effect was chosen, with it."""
+        """Free runs of the model as it was and, where an effect was chosen, with it; base : as it
+        is simulated."""
         self.before = [free_run(*base, e, seed) for e in experiments]
         if chosen is not None:
-            self.after = [free_run(chosen.fitter, chosen.fit, e, seed) for e in experiments]
+            self.after = [free_run(*chosen.simulator, e, seed) for e in experiments]
 
     def add(
         self, label: str, ratio: GainRatio, nats_per_sample: float, gain_mean: float,
@@ -334,10 +341,11 @@ class HeldOutGain:
         """A row of the table and its notes. errors : of the free runs before and after."""
         low, high = ratio.interval
         self.rows.append({
-            "effect": label, "F": ratio.F, "F_low": low, "F_high": high,
+            "effect": label, "horizon": FREE_RUN, "F": ratio.F, "F_low": low, "F_high": high,
             "nats_per_sample": nats_per_sample, "gain_mean": gain_mean,
             "gain_noise": ratio.gain.nats - gain_mean,
             "rmse_before": errors[0], "rmse_after": errors[1],
+            "share": 1.0 - errors[1] / errors[0] if errors[0] > 0.0 else np.nan,
         })  # fmt: skip
         self.notes += ratio.notes(chosen)
 
@@ -347,7 +355,9 @@ class HeldOutRows:
     """The gain on held-out rows: what it is measured with.
 
     base : the model's fitter and fit. chosen : None where no effect was, and the reference stands
-    for it. best_refit : chosen or not.
+    for it. best_refit : chosen or not. simulator, simulation : the base model as it is simulated,
+    and what that is measured by. horizon : rows of the windows that are simulated; None: a tenth of
+    the record.
     """
 
     augmented: AugmentedModels
@@ -356,11 +366,14 @@ class HeldOutRows:
     screen: Screen
     chosen: Refit | None
     best_refit: Refit | None
+    simulator: tuple[Fitter, Fit]
+    simulation: SimulationGain | None = None
+    horizon: int | None = None
 
     def gain(self, label: str, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> HeldOutGain:
         """The chosen model, or else the reference itself, against the base model."""
         out = HeldOutGain()
-        out.simulate(self.base, self.split.experiments, self.chosen, seed)
+        out.simulate(self.simulator, self.split.experiments, self.chosen, seed)
         try:
             self._measure(out, label, seed, checkpoint)
         except SSMError as error:  # a held-out row may be impossible under what others were fit to
@@ -406,3 +419,15 @@ class HeldOutRows:
             label, ratio, ratio.gain.nats_per_sample, gain_of_mean(plain, found),
             (before_error, after_error), chosen is not None,
         )  # fmt: skip
+        which = horizons(experiments, counts, self.horizon)
+        with_curves = reference
+        if self.simulation is not None:
+            found_for = fit_for_simulation(*reference, self.split.train, self.simulation)
+            with_curves = found_for.model
+        after_simulator, number = chosen.simulator if chosen else with_curves, sum(map(sum, counts))
+        ahead = compared(self.simulator, after_simulator, experiments, counts, which, seed)
+        out.rows += table_rows(label, which, ahead, int(number))
+        if chosen is not None and not same:
+            beyond = compared(after_simulator, with_curves, experiments, counts, which[-1:], seed)
+            rows = table_rows(label, which[-1:], beyond, int(number))
+            out.simulated_beyond = (rows[0]["share"], rows[0]["low"]) if rows else None

@@ -21,10 +21,14 @@ DIGITS = 4  # of the numbers that shapes are given in, at least, and of the spre
 
 @dataclass(frozen=True)
 class VariableScale:
-    """The scale of one variable: quantiles of its values and of their sizes at `LEVELS`."""
+    """The scale of one variable: quantiles of its values and of their sizes at `LEVELS`.
+
+    first : the first of its values.
+    """
 
     mean: float
     sd: float
+    first: float
     quantiles: tuple[float, ...]
     sizes: tuple[float, ...]
 
@@ -36,7 +40,9 @@ class VariableScale:
         v = v if v.size else np.zeros(1)
         at = [tuple(map(float, np.quantile(a, LEVELS))) for a in (v, np.abs(v))]
         size = float(np.abs(v).max()) or 1.0  # squares of numbers beyond 1e154 have none
-        return cls(size * float((v / size).mean()), size * float((v / size).std()), *at)
+        return cls(
+            size * float((v / size).mean()), size * float((v / size).std()), float(v[0]), *at
+        )
 
     def quantile(self, level: float) -> float:
         """Quantile of the value, by linear interpolation between `LEVELS`."""
@@ -79,6 +85,7 @@ def value_of(grid: Grid, v: float, scale: VariableScale | None, n: int) -> float
     meaning = {
         "sd": lambda: v * scale.sd,
         "mean": lambda: v * scale.mean,
+        "first": lambda: v * scale.first,
         "quantile": lambda: scale.quantile(v),
         "size": lambda: scale.size(v),
     }

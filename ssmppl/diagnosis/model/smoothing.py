@@ -226,6 +226,18 @@ class Smoother:
             return system.particles, system.weights
         return _drawn(*moments, stream)
 
+    def filtered_draws(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Particles (T, D, N) and weights (T, N) of x_t given y_{1:t} at theta (P,)."""
+        if isinstance(self.kalman, KalmanModel):
+            moments = self.kalman.filter(e, theta)
+            return _drawn(moments.mean, moments.covariance, stream)
+        if isinstance(self.extended, Extended):
+            found = self.extended.filter(e, theta)
+            return _drawn(found.mean, found.covariance, stream, CRPS_DRAWS_CALLED)
+        return self._before_prediction(*self.system(e, theta, stream), e, theta, stream)
+
     @once_property
     def _predictive(self) -> int:
         """Draws behind a prediction of a model that calls a simulator."""
@@ -323,35 +335,53 @@ def crps_ahead(
     """(O, H, K) CRPS of each channel at each horizon, from the rows `origins` (O,) on, by
     default `ORIGINS` of them; NaN where nothing was observed, or the record ends before.
 
-    particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : a transition names
-    observations; rows that lack one are then not simulated on from.
+    particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : as of `samples_ahead`.
     """
-    simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
+    steps, channels = e.y.shape
     if origins is None:
         origins = spread_evenly(steps - 2, ORIGINS)
     if steps < 2:
         return np.full((len(origins), len(horizons), channels), np.nan)
+    at = np.array(horizons) - 1
+    samples = samples_ahead(
+        program, e, theta, particles, weights, stream, feedback, origins, max(horizons), draws, at
+    )
+    rows = origins[:, None] + np.array(horizons)
+    inside = np.minimum(rows, steps - 1)
+    measured = (rows < steps)[..., None] & (e.seen[inside] == 1.0)
+    return crps(samples, np.where(measured, e.y[inside], np.nan))
+
+
+def samples_ahead(
+    program: Program, e: Experiment, theta: np.ndarray, particles: np.ndarray, weights: np.ndarray,
+    stream: np.ndarray, feedback: bool, origins: np.ndarray, reach: int, draws: int,
+    kept: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """(O, H, K, draws) observations simulated from the filtered states of the rows `origins` (O,)
+    on, up to `reach` rows further, with the recorded inputs: those of the rows `kept` (H,) ahead,
+    counted from 0. NaN behind the end of the record.
+
+    particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : a transition names
+    observations; rows that lack one are then not simulated on from.
+    """
+    simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
     levels = np.empty(1)
-    samples = np.full((len(origins), len(horizons), channels, draws), np.nan)
+    samples = np.full((len(origins), len(kept), channels, draws), np.nan)
     known = np.isfinite(particles[origins]).all(axis=(1, 2))  # not a flat start before it is
     for o, t in enumerate(origins.tolist()):
         if not known[o] or (feedback and not np.all(e.seen[t] == 1.0)):
             continue
         fill_uniform(stream, levels)
         chosen = _systematic(weights[t], float(levels[0]), draws)
-        reach = min(max(horizons), steps - 1 - t)
-        states = np.empty((reach, particles.shape[1], draws))
-        drawn = np.empty((reach, channels, draws))
+        rows = min(reach, steps - 1 - t)
+        states = np.empty((rows, particles.shape[1], draws))
+        drawn = np.empty((rows, channels, draws))
         start = np.ascontiguousarray(particles[t][:, chosen])
         y = e.y.copy() if feedback else e.y
         simulate(theta, y, e.seen, e.u, t + 1, start, stream, states, drawn, feedback)
-        for h, horizon in enumerate(horizons):
-            if horizon <= reach:
-                samples[o, h] = drawn[horizon - 1]
-    rows = origins[:, None] + np.array(horizons)
-    inside = np.minimum(rows, steps - 1)
-    measured = (rows < steps)[..., None] & (e.seen[inside] == 1.0)
-    return crps(samples, np.where(measured, e.y[inside], np.nan))
+        inside = kept < rows
+        samples[o, inside] = drawn[kept[inside]]
+    return samples
 
 
 def _systematic(weights: np.ndarray, level: float, draws: int) -> np.ndarray:

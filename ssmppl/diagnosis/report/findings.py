@@ -23,13 +23,13 @@ MODES = ("full", "fast")
 COLUMNS: dict[str, tuple[str, ...]] = {
     "where": ("equation", "moment", "t_from", "t_to", "region", "z", "p", "experiment"),
     "causes": (
-        "effect", "form", "equation", "z", "p", "gain_screen", "gain_refit", "class_id", "sign",
-        "estimate", "se",
+        "effect", "form", "equation", "kind", "z", "p", "gain_screen", "gain_refit", "class_id",
+        "sign", "estimate", "se",
     ),
     "classes": ("class_id", "effect", "equation", "rho", "separating_input"),
     "closed": (
-        "effect", "F", "F_low", "F_high", "nats_per_sample", "gain_mean", "gain_noise",
-        "rmse_before", "rmse_after",
+        "effect", "horizon", "rmse_before", "rmse_after", "share", "low", "high",
+        "nats_per_sample", "F", "F_low", "F_high", "gain_mean", "gain_noise",
     ),
     "missing": ("equation", "variable", "value", "estimate", "low", "high"),
     "detection": ("channel", "statistic", "value", "z", "p"),

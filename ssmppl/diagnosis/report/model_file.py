@@ -333,7 +333,7 @@ def terms_with(roots: Iterable[Expr], parameter: Expr) -> list[Expr]:
         node = stack.pop(0)
         if node.op in _ADDITIVE or node.op == OP or (node.op == "item" and node.args[0].op == OP):
             stack += [a for a in node.args if depends_on(a, [parameter])]
-        elif node.args and node not in out:
+        elif node.args and all(node is not n for n in out):
             out.append(node)
     return out
 

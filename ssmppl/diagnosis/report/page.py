@@ -33,7 +33,8 @@ HEADINGS = {
     "estimate": "strength", "se": "±", "rho": "correlation", "separating_input": "separating input",
     "nats_per_sample": "nats per sample", "gain_mean": "nats, conditional mean",
     "gain_noise": "nats, rest of the distribution", "rmse_before": "error before",
-    "rmse_after": "error after", "p": "p",
+    "rmse_after": "error after", "p": "p", "horizon": "rows ahead", "share": "error reduced by",
+    "low": "from", "high": "to",
 }  # fmt: skip
 MODELS = {"before": "original model", "after": "augmented model"}
 TABLES = {
@@ -204,7 +205,10 @@ def _answers(report: Findings) -> str:
     cause = {NONE_OF_THESE: "none of these", NO_GAP: "no significant effect"}
     first = (words.rows(report.closed) or [{"F": None}])[0]
     far, ends = "not measured", ""
-    if is_number(first["F"]):
+    window = words.windows(report)
+    if words.simulated(report) and window is not None:
+        far, ends = percent(window["share"]), interval(window["low"], window["high"])
+    elif is_number(first["F"]):
         far, ends = percent(first["F"]), interval(first["F_low"], first["F_high"])
     cards = (
         ("Where is the gap?", spot, "", words.where(report)),
@@ -269,7 +273,7 @@ def _alt(report: Findings, name: str) -> str:
         return f"Bars of the log-likelihood gain in nats: {'; '.join(items)}."
     if name == "gap_closed":
         items = [f"{r['effect']} {percent(r['F'])} ({interval(r['F_low'], r['F_high'])})"
-                 for r in words.rows(report.closed)]  # fmt: skip
+                 for r in words.rows(report.closed) if is_number(r["F"])]  # fmt: skip
         return f"Share of the reference model's gain, with its 95% interval: {'; '.join(items)}."
     if name == "missing_term":
         items = [f"missing term in {e} over {v}" for e, v in curves(report)]
@@ -328,7 +332,7 @@ def _cell(column: str, value: Any, letters: dict[Any, str]) -> str:
         return letters.get(value, "")
     if column == "p":
         return p_text(value).removeprefix("p ").removeprefix("= ") if is_number(value) else ""
-    if column in ("F", "F_low", "F_high"):
+    if column in ("F", "F_low", "F_high", "share", "low", "high"):
         return percent(value)
     if column.startswith("t_"):
         return span(value, value).removeprefix("t = ")

@@ -159,7 +159,8 @@ def causes_table(
         if screen_is_current:
             p = min(float(significant[k]), tested.get(k, 1.0))
         rows.append({
-            "effect": c.effect.name, "equation": c.equation, "z": float(s.z[k]),
+            "effect": c.effect.name, "equation": c.equation, "kind": c.effect.cause,
+            "z": float(s.z[k]),
             "p": float(np.minimum(1.0, tests * p)),
             "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
             "class_id": int(found.class_id[i]), **estimate,

@@ -7,8 +7,10 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from ssmppl import markup
+from ssmppl.diagnosis.heldout.simulation import FREE_RUN
 from ssmppl.diagnosis.report import words
-from ssmppl.drawing.numerals import DASH, is_number, number, p_text, with_error
+from ssmppl.diagnosis.verdict.verdicts import NO_GAP
+from ssmppl.drawing.numerals import DASH, interval, is_number, number, p_text, percent, with_error
 
 if TYPE_CHECKING:
     from ssmppl.diagnosis.report.findings import Findings
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 PAGE = 100  # columns
 SHOWN_CAUSES = 8
 PREDICTED = "* score-test approximation, model not refitted"
+AHEAD = "Error of simulations of held-out rows, so many rows ahead (95% intervals)"
 ALIKE = "Effects with the same letter are not distinguishable by these data."
 
 
@@ -33,6 +36,20 @@ def cause_rows(report: Findings, shown: int = SHOWN_CAUSES) -> list[tuple[str, .
         out.append((name, form, with_error(r["estimate"], r["se"]), gain,
                     p_text(r["p"]).removeprefix("p ").removeprefix("= "),
                     letters.get(r["class_id"], "")))  # fmt: skip
+    return out
+
+
+def horizon_rows(report: Findings) -> list[tuple[str, ...]]:
+    """Header and a line for each horizon: rows ahead, errors before and after, what is gained."""
+    out: list[tuple[str, ...]] = [("rows ahead", "", "error before", "after", "reduced by",
+                                    "nats per row")]  # fmt: skip
+    for r in words.rows(report.closed):
+        ends = f" ({interval(r['low'], r['high'])})" if is_number(r["low"]) else ""
+        if is_number(r["rmse_before"]) and is_number(r["share"]):
+            out.append((str(r["horizon"]), "", number(r["rmse_before"]), number(r["rmse_after"]),
+                        percent(r["share"]) + ends.replace("95% interval ", ""),
+                        "" if r["horizon"] == FREE_RUN else number(r["nats_per_sample"], 2),
+                        ))  # fmt: skip
     return out
 
 
@@ -69,6 +86,9 @@ def report_text(report: Findings) -> str:
             :: 1 if len(report.closed) else 2
         ]:
             lines += wrapped(f"{term}: {words.GLOSSARY[term]}.")
+    ahead = horizon_rows(report)
+    if len(ahead) > 1 and report.verdict != NO_GAP:
+        lines += ["", AHEAD, *_table(ahead)]
     for name, found in _rest(report):
         lines += ["", name]
         for item in found:
@@ -85,6 +105,12 @@ def report_html(report: Findings) -> str:
         if sentences
     ]
     parts.append(markup.table(rows_of_answers, left=(0, 1)))
+    head, *ahead = horizon_rows(report)
+    if ahead and report.verdict != NO_GAP:
+        keep = [i for i in range(len(head)) if any(row[i] for row in ahead)]
+        parts.append(markup.paragraph(AHEAD))
+        parts.append(markup.table([[markup.text(row[i]) for i in keep] for row in ahead],
+                                  [head[i] for i in keep], [0]))  # fmt: skip
     head, *causes = cause_rows(report)
     if causes:
         keep = [i for i in range(len(head)) if any(row[i] for row in causes)]

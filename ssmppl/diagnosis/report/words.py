@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from ssmppl.diagnosis.heldout.simulation import WINDOWED
 from ssmppl.diagnosis.verdict.verdicts import CURVES, EFFECT, NO_GAP, NONE_OF_THESE
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
 
@@ -159,6 +160,27 @@ def share(report: Findings) -> str:
            f"predictive density ({interval(first['F_low'], first['F_high'])})"  # fmt: skip
 
 
+def windows(report: Findings) -> dict[str, Any] | None:
+    """The row of `closed` that the report leads with: simulations of a stretch of rows."""
+    return next((r for r in rows(report.closed) if WINDOWED in str(r["horizon"])), None)
+
+
+def simulated(report: Findings) -> str:
+    """What the effect does to the error of simulations, with its interval; "" if not measured."""
+    r = windows(report)
+    if r is None or not all(is_number(r[c]) for c in ("share", "low", "high")):
+        return ""
+    count = str(r["horizon"]).partition(WINDOWED)[2]
+    what = f"the error of simulations over {count} row{'s' * (count != '1')}"
+    if r["low"] > 0.0:
+        return f"reduces {what} by {percent(r['share'])} ({interval(r['low'], r['high'])})"
+    if r["high"] < 0.0:
+        ends = interval(-r["high"], -r["low"])
+        return f"increases {what} by {percent(-r['share'])} ({ends})"
+    return f"does not measurably reduce {what} ({percent(r['share'])}, " \
+           f"{interval(r['low'], r['high'])})"  # fmt: skip
+
+
 def kept_back(report: Findings) -> str:
     """Which data took no part in choosing."""
     if "cross-fitting" in report.parts:
@@ -219,6 +241,10 @@ def headline(report: Findings) -> str:
         return sentence(f"{text} The held-out gain has not been measured yet")
     lacks, adding = _lacks(groups)
     text, measured = f"{named(report)} lacks {lacks}", share(report)
+    if told := simulated(report):
+        own = "" if measured else f" ({sure})"
+        rest = sentence(f"{kept_back(report)}, {adding[0].lower()}{adding[1:]} {told}")
+        return f"{sentence(text + own)} {rest}"
     if measured:
         return sentence(f"{text}. {adding} {measured}")
     if not rows(report.closed):
@@ -372,8 +398,18 @@ def how_far(report: Findings) -> list[str]:
     if not closed:
         return ["Not measured."]
     first, out = closed[0], []
+    told = simulated(report)
+    if told:
+        r = windows(report) or {}
+        ends = f"{number(r['rmse_before'])} to {number(r['rmse_after'])}"
+        out.append(
+            sentence(f"{kept_back(report)}, {first['effect']} {told}: from {ends} (RMS, units of "
+                     "the data). Each simulation starts in the state that the model's filter has "
+                     "for its first row, and does not see the data again")
+        )  # fmt: skip
     if is_number(first["F"]):
-        out.append(sentence(f"{kept_back(report)}, {first['effect']} {share(report)}"))
+        own = f"{kept_back(report)}, {first['effect']}" if not told else "it"
+        out.append(sentence(f"{own} {share(report)}"))
         if first["F"] < 0:
             out.append("A share below zero means that it made the predictions worse.")
     elif report.verdict == NO_GAP:
@@ -399,8 +435,8 @@ def how_far(report: Findings) -> list[str]:
     before, after = first["rmse_before"], first["rmse_after"]
     if is_number(before) and is_number(after):
         way = "decreases" if after < before else "increases"
-        out.append(f"Open-loop (free-run) simulation error {way} from {number(before)} to "
-                   f"{number(after)} (RMS, units of the data).")  # fmt: skip
+        out.append(f"Open-loop (free-run) simulation error, from the first row on, {way} from "
+                   f"{number(before)} to {number(after)} (RMS, units of the data).")  # fmt: skip
     return out
 
 

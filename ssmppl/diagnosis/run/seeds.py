@@ -33,6 +33,7 @@ class Choice(IntEnum):
     BASE = 6  # fitted from the best refit
     SHAPES = 7
     CHOSEN_SHAPES = 8
+    SIMULATION = 9  # predictions further ahead of the model as it is
 
 
 class Task(IntEnum):
@@ -56,6 +57,7 @@ class Stream(IntEnum):
     FREE_RUN = 7
     TOP = 8  # of the extended filter, checked by particles
     WAVES = 9  # refined in period and phase
+    AHEAD = 10  # simulations from filtered states
 
 
 def child_seed(seed: np.random.SeedSequence, *path: int) -> np.random.SeedSequence:

@@ -21,6 +21,7 @@ from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.fit import FROM_START, Fit
+from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import (
     Refit,
     best_of_groups,
@@ -29,15 +30,18 @@ from ssmppl.diagnosis.selection.refit import (
     leading,
     one_signed_candidates,
     pairs,
+    preferred,
     refit_all,
 )
 from ssmppl.diagnosis.selection.refit_test import CLOSER_LOOK_FACTOR, affordable, gain_p, refit_p
 from ssmppl.diagnosis.selection.shapes import shaped_all
+from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, gain_of_base
 from ssmppl.errors import SSMError
 
 AFRESH = "refitting from default start"
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is run
+CARRIES_ON = 0.1  # of what a further cause gains one row ahead, that it has to gain beyond
 FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
 AGAIN_CALLED = 60  # likewise, of a model that calls a simulator
 
@@ -52,6 +56,8 @@ class SelectionResult:
     others were not refitted. unfitted : the column of what stands out most, where it could not be
     refitted and nothing that could be gains as much. rebased : whether `base` is not what the
     screen was run at. left_out : whether fewer were chosen in the end, by the held-out rows.
+    simulation : how well the model as it is predicts further ahead than one row, with the
+    parameters of `simulating`.
     """
 
     base: Fit
@@ -63,6 +69,8 @@ class SelectionResult:
     unfitted: int | None = None
     rebased: bool = False
     left_out: bool = False
+    simulation: SimulationGain | None = None
+    simulating: SimulationFit | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -74,7 +82,7 @@ class EffectSelection:
     best one even where the screen finds nothing. singles : how many are refitted; None: the
     leading ones and what correlates with them. most : effects in all. approximate : by approximate
     fits (`Effort`), without standard errors. further : whether screens run again around what was
-    chosen look for more.
+    chosen look for more. horizon : as of `diagnose`.
     """
 
     augmented: AugmentedModels
@@ -88,10 +96,13 @@ class EffectSelection:
     most: int = MOST_EFFECTS
     approximate: bool = False
     further: bool = True
+    horizon: int | None = None
 
     def run(self, out: SelectionResult) -> None:
         """Refit, choose, and step forward; into `out`, which keeps what came before an error."""
         guard = self.checkpoint.failures.guard
+        with guard("predictions further ahead"):
+            out.simulation, out.simulating = self._simulation(out.base)
         self._refit_singles(out)
         found = self.always or self._significant(out)
         if not found or not out.refits or out.unfitted is not None:
@@ -99,6 +110,7 @@ class EffectSelection:
         if not self.approximate:
             with guard("estimating shapes"):
                 out.refits = self._shaped(out, out.refits, Choice.SHAPES, "estimating shapes")
+        out.refits = preferred(out.refits, critical_gain(self.screen, self.alpha))
         out.chosen = out.refits[0]
         single, pair = out.chosen, None
         if self.most > 1:
@@ -109,7 +121,7 @@ class EffectSelection:
             if self.further:
                 with guard("whether a second effect is missing"):
                     self._forward(out, 2)
-            if rival is not None and rival.penalised_gain > out.chosen.penalised_gain:
+            if rival is not None and rival.score > out.chosen.score:
                 out.chosen = rival
             if len(out.chosen.candidates) == 2 and self.further:
                 pair = out.chosen
@@ -139,21 +151,26 @@ class EffectSelection:
         for stage, which in stages.items():
             with self.checkpoint.failures.guard(stage):
                 more, failed = self._refit(
-                    out.base, screen, [[k] for k in which()], self._seed(Choice.SINGLES), stage,
-                    afresh=stage == AFRESH,
+                    out, out.base, screen, [[k] for k in which()], self._seed(Choice.SINGLES),
+                    stage, afresh=stage == AFRESH,
                 )  # fmt: skip
                 refits = best_of_groups(screen, refits + more)
                 out.notes += [f"not refitted: {reason}" for reason in failed]
         out.refits = refits
 
+    def _simulation(self, base: Fit) -> tuple[SimulationGain, SimulationFit]:
+        fitter = self.augmented.base_fitter
+        seed = self._seed(Choice.SIMULATION)
+        return gain_of_base(fitter, base, self.train, seed, self.horizon)
+
     def _refit(
-        self, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
+        self, out: SelectionResult, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
         seed: np.random.SeedSequence, stage: str, given: Sequence[Candidate] = (), *,
         checkpoint: Checkpoint | None = None, afresh: bool = False,
     ) -> tuple[list[Refit], list[str]]:  # fmt: skip
         return refit_all(
             self.augmented, base, screen, sets, self.train, seed, checkpoint or self.checkpoint,
-            stage, given, afresh=afresh, approximate=self.approximate,
+            stage, given, afresh=afresh, approximate=self.approximate, simulation=out.simulation,
         )  # fmt: skip
 
     def _shaped(
@@ -161,7 +178,7 @@ class EffectSelection:
     ) -> list[Refit]:
         return shaped_all(
             self.augmented, out.base, self.screen.design.scales, refits, self.train,
-            self._seed(place), self.checkpoint, stage,
+            self._seed(place), self.checkpoint, stage, out.simulation,
         )  # fmt: skip
 
     # -- tests
@@ -185,9 +202,10 @@ class EffectSelection:
         place for the parameters gains by that, and not by its effect. Only where it gains enough.
         """
         worth = critical_gain(self.screen, self.alpha)
-        if not out.refits or out.refits[0].penalised_gain < worth:
+        highest = max(out.refits, key=lambda r: r.penalised_gain, default=None)
+        if highest is None or highest.penalised_gain < worth:
             return
-        fitter, best = self.augmented.base_fitter, out.refits[0].fit
+        fitter, best = self.augmented.base_fitter, highest.fit
         start = {n: v for n, v in best.by_parameter.items() if n in self.augmented.trace.parameters}
         numbers = self.checkpoint.computed(
             "fitting from the best refit",
@@ -203,7 +221,13 @@ class EffectSelection:
                 "refitted have none, and `where` and the tests of the one-step predictions refer "
                 "to the earlier optimum"
             )
-            out.refits = [replace(r, gain=r.gain - better) for r in out.refits]
+            before, lost = out.simulation, 0.0
+            out.simulation, out.simulating = self._simulation(found)
+            if before:
+                lost = before.gain(out.simulation.before)
+            out.refits = [
+                replace(r, gain=r.gain - better, ahead=r.ahead - lost) for r in out.refits
+            ]
 
     def _by_refit(self, out: SelectionResult, alpha: float) -> bool:
         """Whether a refit gains more than chance: by bootstrap where that is affordable, else by
@@ -232,14 +256,20 @@ class EffectSelection:
         """The best of the pairs of which the screen promises most, where it is clearly better than
         the best single one."""
         out.doubles, failed = self._refit(
-            out.base, self.screen, pairs(self.screen, out.refits), self._seed(Choice.PAIRS),
+            out, out.base, self.screen, pairs(self.screen, out.refits), self._seed(Choice.PAIRS),
             "refitting pairs",
         )  # fmt: skip
         out.notes += [f"not refitted: {reason}" for reason in failed]
         if not out.doubles:
             return None
-        more = out.doubles[0].penalised_gain - out.refits[0].penalised_gain
-        return out.doubles[0] if more >= critical_gain(self.screen, self.alpha) else None
+        worth = critical_gain(self.screen, self.alpha)
+        best, single = preferred(out.doubles, worth)[0], out.refits[0]
+        further = replace(
+            best, gain=best.gain - single.gain, cost=best.cost - single.cost,
+            ahead=best.ahead - single.ahead,
+        )  # fmt: skip
+        enough = further.penalised_gain >= worth and _simulates(further, worth)
+        return best if enough else None
 
     def _forward(self, out: SelectionResult, most: int) -> None:
         """Screen again around the chosen model, and add what stands out, up to `most` effects."""
@@ -262,18 +292,21 @@ class EffectSelection:
             if float(np.min(again.family.p, initial=1.0)) > CLOSER_LOOK_FACTOR * self.alpha:
                 return
             more, _ = self._refit(
-                chosen.fit, again, [[k] for k in leading(again)[:FOLLOWERS]],
+                out, chosen.fit, again, [[k] for k in leading(again)[:FOLLOWERS]],
                 child_seed(seed, Task.FURTHER_REFITS + number), "refitting", chosen.candidates,
                 checkpoint=self.checkpoint.within(f"with {number + 1} effects"),
             )  # fmt: skip
-            if not more or more[0].penalised_gain < critical_gain(again, self.alpha):
+            worth, so_far = critical_gain(again, self.alpha), chosen.ahead
+            more = [replace(r, ahead=r.ahead - so_far) for r in more]
+            more = [r for r in more if r.penalised_gain >= worth and _simulates(r, worth)]
+            if not more:
                 return
-            best = more[0]
+            best = preferred(more, worth)[0]
             column = {c.key: k for k, c in enumerate(self.screen.design.candidates)}
             index = (*chosen.index, column[again.design.candidates[best.index[0]].key])
             out.chosen = chosen = Refit(
                 index, best.candidates, best.fitter, best.fit, chosen.gain + best.gain,
-                chosen.cost + best.cost,
+                chosen.cost + best.cost, chosen.ahead + best.ahead, best.simulating,
             )  # fmt: skip
 
     def _seed(self, step: Choice) -> np.random.SeedSequence:
@@ -305,6 +338,14 @@ def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | No
         found = int(screen.groups[k]) not in done and screen.efficient.gain[k] > best
         return k if found and float(screen.candidate_p[k]) <= alpha else None
     return None
+
+
+def _simulates(r: Refit, worth: float) -> bool:
+    """Whether a further effect is one of a simulator, by what it gains beside those chosen: a cause
+    gains further ahead too, and what only describes a misfit loses next to nothing there."""
+    if r.describes:
+        return r.score > 0.0 and r.ahead >= -worth
+    return r.ahead >= CARRIES_ON * r.penalised_gain - worth
 
 
 def _others(screen: Screen, chosen: Refit) -> list[Candidate]:

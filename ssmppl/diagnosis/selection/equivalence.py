@@ -154,7 +154,7 @@ def _gain(z: np.ndarray, signs: np.ndarray) -> np.ndarray:
 
 
 def group_leaders(screen: Screen, refits: Sequence[Refit]) -> list[int]:
-    """Best shape of each group: the refitted by their penalised gain, then others by height."""
+    """Best shape of each group: the refitted as they are ordered, then others by height."""
     done = [r.index[0] for r in refits if len(r.index) == 1]
     family, groups = screen.family, screen.groups
     known = {int(groups[k]) for k in done}
@@ -164,8 +164,12 @@ def group_leaders(screen: Screen, refits: Sequence[Refit]) -> list[int]:
 
 
 def equivalence_classes(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:
-    """Classes of the candidates in `order` (of `group_leaders`); each weak one is its own."""
-    refitted = {r.index[0]: max(r.penalised_gain, 0.0) for r in refits if len(r.index) == 1}
+    """Classes of the candidates in `order` (of `group_leaders`); each weak one is its own.
+
+    What gained more than the first one and was passed over for it only describes a misfit
+    (`preferred`): it is no rival, and not in its class.
+    """
+    refitted = {r.index[0]: max(r.score, 0.0) for r in refits if len(r.index) == 1}
     at = np.array(order, dtype=int)
     rho, sided = screen.efficient.rho[np.ix_(at, at)], screen.efficient.sided[at]
     gains = np.array([refitted.get(int(k), screen.efficient.gain[k]) for k in at])
@@ -191,8 +195,8 @@ def _of_the_best(
 ) -> np.ndarray:
     """(K,) bool: the confidence set among the refitted, who come first, and who is like the best
     among those that were not."""
-    own = slice(0, refitted)
-    cut = cuts(rho[own, own], gains[own], range(refitted), sided=sided[own])
+    own = np.flatnonzero(gains[:refitted] <= gains[0])
+    cut = cuts(rho[np.ix_(own, own)], gains[own], range(len(own)), sided=sided[own])
     out = np.zeros(len(gains), bool)
     out[own] = confidence_set(gains[own], cut)
     alike = ~distinguishable(gains[0], similarity(rho, sided)[0]) & strong

@@ -20,6 +20,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import takewhile
+from typing import Any
 
 import numpy as np
 
@@ -208,7 +209,7 @@ class Fitter:
         place = {s: i for i, s in enumerate(trace.parameter_symbols)}
         self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)
 
-    def with_fixed(self, values: Mapping[str, float]) -> Fitter:
+    def with_fixed(self, values: Mapping[str, Any]) -> Fitter:
         """The same with other values of parameters that are fixed."""
         if not values:
             return self
@@ -441,7 +442,7 @@ class Fitter:
 
     def _with_process_noise(self, space: Space, share: float) -> Space:
         """The space with the scales of the transition's noise at a share of what they are."""
-        names = [n for n in self._process_noise_scales if n not in self.fixed]
+        names = [n for n in self.process_noise_scales if n not in self.fixed]
         if share == 1.0 or not names:
             return space
         trace = space.problem.trace
@@ -452,7 +453,7 @@ class Fitter:
         return at(space, theta)
 
     @cached_property
-    def _process_noise_scales(self) -> set[str]:
+    def process_noise_scales(self) -> set[str]:
         """Positive parameters that the noise of the transition is made of."""
         gaussian, trace = self.problem.program.gaussian, self.problem.trace
         if not isinstance(gaussian, GaussianApproximation):

@@ -2,19 +2,20 @@
 
 The score is a screen only: noise that has grown shrinks it, and near equivalents swap places. What
 ranks is the log-likelihood after refitting, each fit starting where the screen's quadratic
-expects its top.
+expects its top, with what predictions further ahead than one row gain.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, refine_wave, starts_of
+from ssmppl.diagnosis.effects.effect import ASKED, NOISE_LAW, UNKNOWN_INPUT
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Stream, Task, child_seed
 from ssmppl.diagnosis.screening.efficient_score import Efficient
@@ -29,6 +30,8 @@ from ssmppl.diagnosis.selection.fit import (
     Fitter,
     standard_errors,
 )
+from ssmppl.diagnosis.selection.horizons import SimulationGain
+from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, fit_for_simulation, restored
 from ssmppl.errors import NotApplicable, SSMError
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
@@ -44,6 +47,8 @@ SAME_IN_PAIR = 0.98  # beyond which they make no pair
 NEAR = 25.0  # nats behind the best, up to which other delays are tried
 ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
 
+EXPLAINED = 0.5  # of the score of an unknown input, by a mechanism that is named in its place
+
 # How a refit starts, and when it is ranked.
 SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
 OPEN, OPEN_SHARE = 5.0, 0.25  # nats, and share of its gain, that a fit may leave and be ranked
@@ -56,7 +61,8 @@ class Refit:
     """A model with effects, fitted.
 
     index : their places among the screen's candidates. gain : nats over the model without them.
-    cost : of these, what the choice of their shapes is worth.
+    cost : of these, what the choice of their shapes is worth. ahead : nats that predictions more
+    than one row ahead gain (`SimulationGain`). simulating : with the parameters for that.
     """
 
     index: tuple[int, ...]
@@ -65,11 +71,42 @@ class Refit:
     fit: Fit
     gain: float
     cost: float = 0.0
+    ahead: float = 0.0
+    simulating: SimulationFit | None = None
+
+    @property
+    def simulator(self) -> tuple[Fitter, Fit]:
+        """The model by which it is simulated."""
+        return self.simulating.model if self.simulating else (self.fitter, self.fit)
 
     @property
     def penalised_gain(self) -> float:
-        """The gain that ranks refits: a date chosen among hundreds gains nats by that alone."""
+        """The gain that is tested: a date chosen among hundreds gains nats by that alone."""
         return self.gain - self.cost
+
+    @property
+    def score(self) -> float:
+        """What ranks refits: gains at all horizons, of one row and of more."""
+        return self.penalised_gain + self.ahead
+
+    @property
+    def asked(self) -> int:
+        """When its effect is asked, of several the one that is asked last (`ASKED`)."""
+        return max((ASKED[c.effect.cause] for c in self.candidates), default=0)
+
+    @property
+    def describes(self) -> bool:
+        """Whether an effect of it only describes a misfit, and is no cause."""
+        return any(c.effect.cause in (UNKNOWN_INPUT, NOISE_LAW) for c in self.candidates)
+
+    def simulated(
+        self, train: Sequence[Experiment], numbers: Numbers, of_base: SimulationGain | None
+    ) -> Refit:
+        """The same with what the numbers of its fit for simulation say."""
+        if of_base is None:
+            return self
+        found = restored(self.fitter, self.fit, train, numbers)
+        return replace(self, ahead=of_base.gain(found.squares), simulating=found)
 
     @property
     def strengths(self) -> list[float]:
@@ -263,9 +300,25 @@ def one_signed_candidates(screen: Screen) -> list[int]:
 def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
     """The best of refits that differ in their shapes only; best first."""
     out: dict[int, Refit] = {}
-    for r in sorted(refits, key=lambda r: -r.penalised_gain):
+    for r in sorted(refits, key=lambda r: -r.score):
         out.setdefault(int(screen.groups[r.index[0]]), r)
     return list(out.values())
+
+
+def preferred(refits: Sequence[Refit], worth: float) -> list[Refit]:
+    """The refits in the order in which they are named: what gains most first, but for what fits any
+    misfit, or what happened once: that comes behind a cause which is asked earlier (`ASKED`), gains
+    `worth` by itself and has `EXPLAINED` of its score."""
+    rest, out = sorted(refits, key=lambda r: -r.score), []
+    while rest:
+        best = rest[0]
+        for r in rest:
+            explains = r.penalised_gain >= worth and r.score >= EXPLAINED * rest[0].score
+            if r.asked < best.asked and explains:
+                best = r
+        rest.remove(best)
+        out.append(best)
+    return out
 
 
 def _promising(screen: Screen) -> list[int]:
@@ -301,14 +354,15 @@ def refit_all(
     augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str,
     given: Sequence[Candidate] = (), *, afresh: bool = False, approximate: bool = False,
+    simulation: SimulationGain | None = None,
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
     """The refits that came to an end, best first, and why the others did not. afresh, approximate :
-    as of `refit`."""
+    as of `refit`. simulation : of the model as it is, for `Refit.ahead`; None: that is 0."""
     shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
     one = partial(_one, augmented, base, screen, list(sets), tuple(train), seed, added, afresh,
-                  approximate)  # fmt: skip
+                  approximate, simulation)  # fmt: skip
     done, reasons = [], []
     results = checkpoint.map(stage, len(sets), one)
     for index, candidates, numbers in zip(sets, added, results, strict=True):
@@ -328,22 +382,27 @@ def refit_all(
             )
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
-        done.append(Refit(tuple(index), candidates, fitter, fit, gain, cost))
-    done.sort(key=lambda r: -r.penalised_gain)
+        made = Refit(tuple(index), candidates, fitter, fit, gain, cost)
+        done.append(made.simulated(train, numbers, simulation))
+    done.sort(key=lambda r: -r.score)
     return done, reasons
 
 
 def _one(
     augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
-    added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool, k: int,
+    added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool,
+    simulation: SimulationGain | None, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
     own = child_seed(seed, Task.REFIT, k)
     found = refit(augmented, base, screen, sets[k], train, own, added[k], afresh, approximate)
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}
-    return found.fit.numbers
+    if simulation is None:
+        return found.fit.numbers
+    found_for = fit_for_simulation(found.fitter, found.fit, train, simulation)
+    return {**found.fit.numbers, **found_for.numbers}
 
 
 def _shaped(

@@ -21,7 +21,9 @@ from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import child_seed
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, range_fraction
 from ssmppl.diagnosis.selection.fit import Fit
+from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import Refit, effort_for
+from ssmppl.diagnosis.selection.simulation_fit import fit_for_simulation
 from ssmppl.errors import SSMError
 
 SHAPED = 4  # refits at most
@@ -55,17 +57,22 @@ def shape_bounds(c: Candidate, scales: Scales) -> dict[str, tuple[float, float]]
 def shaped_all(
     augmented: AugmentedModels, base: Fit, scales: Scales, refits: Sequence[Refit],
     train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str,
+    simulation: SimulationGain | None = None,
 ) -> list[Refit]:  # fmt: skip
     """The refits, best first; those near the best of them with their shapes estimated, where that
-    gains more than `PRICE` for each shape."""
+    gains more than `PRICE` for each shape, at all horizons together too.
+
+    simulation : as of `refit_all`.
+    """
     out = list(refits)
-    least = min(out[0].penalised_gain - WITHIN, SHARE * out[0].penalised_gain)
+    best = max(r.score for r in out)
+    least = min(best - WITHIN, SHARE * best)
     tried = [
         i for i, r in enumerate(out)
-        if r.penalised_gain >= least and any(shape_bounds(c, scales) for c in r.candidates)
+        if r.score >= least and any(shape_bounds(c, scales) for c in r.candidates)
     ][: SHAPED_CALLED if simulators(augmented.trace) else SHAPED]  # fmt: skip
 
-    one = partial(_one, augmented, scales, [out[i] for i in tried], tuple(train), seed)
+    one = partial(_one, augmented, scales, [out[i] for i in tried], tuple(train), seed, simulation)
     for i, numbers in zip(tried, checkpoint.map(stage, len(tried), one), strict=True):
         name = " and ".join(map(str, out[i].candidates))
         checkpoint.failures.record_task(f"the shapes of {name}", numbers)
@@ -76,16 +83,24 @@ def shaped_all(
             fit = fitter.restored(train, numbers)
             cost = old.cost + PRICE * len(shapes)
             gain = fit.log_likelihood - base.log_likelihood
-            if gain - cost > old.penalised_gain:
-                out[i] = Refit(old.index, made, fitter, fit, gain, cost)
-    return sorted(out, key=lambda r: -r.penalised_gain)
+            new = Refit(old.index, made, fitter, fit, gain, cost)
+            new = new.simulated(train, numbers, simulation)
+            if new.penalised_gain > old.penalised_gain and new.score > old.score:
+                out[i] = new
+    return sorted(out, key=lambda r: -r.score)
 
 
 def _one(
     augmented: AugmentedModels, scales: Scales, refits: Sequence[Refit],
-    train: Sequence[Experiment], seed: np.random.SeedSequence, k: int,
+    train: Sequence[Experiment], seed: np.random.SeedSequence, simulation: SimulationGain | None,
+    k: int,
 ) -> Numbers:  # fmt: skip
-    return _shaped(augmented, scales, refits[k], train, child_seed(seed, k))
+    found = _shaped(augmented, scales, refits[k], train, child_seed(seed, k))
+    if "shapes" not in found or simulation is None:
+        return found
+    fitter = augmented.fitter(_reshaped(refits[k].candidates, scales, found["shapes"]))
+    fit = fitter.restored(train, found)
+    return {**found, **fit_for_simulation(fitter, fit, train, simulation).numbers}
 
 
 def _shaped(

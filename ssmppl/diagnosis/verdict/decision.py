@@ -99,14 +99,20 @@ def stands_out(alpha: float, *found: pd.DataFrame) -> bool:
 
 def curves_beat(far: HeldOutGain, chosen: bool) -> bool:
     """Whether smooth curves predict the held-out rows better than the best of the catalogue: more
-    than chance explains, and, where effects were chosen, by more than a trifle of the gap."""
+    than chance explains, and, where effects were chosen, by more than a trifle of the gap, one row
+    ahead and in simulations. Curves that one row confirms and simulations do not are no cause."""
     if (
         far.beyond_catalogue is None
         or not far.beyond_catalogue.nats > SIGNIFICANT_GAIN_SE * far.beyond_catalogue.error
     ):
         return False
     share = float(far.rows[0]["F"]) if chosen and far.rows else np.nan
-    return not share > 1.0 - LEAST_SHARE_LEFT
+    if share > 1.0 - LEAST_SHARE_LEFT:
+        return False
+    if not chosen or far.simulated_beyond is None:
+        return True
+    better, low = far.simulated_beyond
+    return low > 0.0 and better > LEAST_SHARE_LEFT
 
 
 def testable_candidates(screen: Screen) -> list[Candidate]:

@@ -54,6 +54,12 @@ class Results:
         return self.selection.chosen if self.selection else None
 
     @property
+    def simulator(self) -> tuple[Fitter, Fit]:
+        """The model as it is, with its parameters for simulation."""
+        found = self.selection.simulating if self.selection else None
+        return found.model if found else (self.base, self.fit)
+
+    @property
     def names(self) -> list[str]:
         """Labels of the chosen effects."""
         offered = self.screen.design.candidates

@@ -21,18 +21,22 @@ from tests.models import gaps as models
 
 
 @pytest.mark.parametrize(
-    ("nats", "error", "share", "chosen", "expected"),
+    ("nats", "error", "share", "simulated", "chosen", "expected"),
     [
-        (16.0, 3.0, 0.58, True, True),
-        (16.0, 9.0, 0.58, True, False),  # chance explains it
-        (2.9, 0.9, 0.94, True, False),  # the catalogue's effects close nearly all
-        (6.0, 2.0, float("nan"), True, True),  # no share is given
-        (6.0, 2.0, 1.0, False, True),  # nothing was chosen: the share is the curves' own
-        (-6.0, 2.0, 1.2, True, False),
+        (16.0, 3.0, 0.58, None, True, True),
+        (16.0, 3.0, 0.58, (0.4, 0.2), True, True),
+        (16.0, 3.0, 0.58, (0.4, -0.1), True, False),  # as far as simulations tell
+        (16.0, 3.0, 0.58, (0.1, 0.05), True, False),  # a trifle, many rows ahead
+        (16.0, 9.0, 0.58, (0.4, 0.2), True, False),  # chance explains it
+        (2.9, 0.9, 0.94, None, True, False),  # the catalogue's effects close nearly all
+        (6.0, 2.0, float("nan"), None, True, True),  # no share is given
+        (6.0, 2.0, 1.0, None, False, True),  # nothing was chosen: the share is the curves' own
+        (-6.0, 2.0, 1.2, None, True, False),
     ],
 )
-def test_curves_beat_the_catalogue(nats, error, share, chosen, expected):
-    far = SimpleNamespace(beyond_catalogue=Gain(nats, error, nats / 150), rows=[{"F": share}])
+def test_curves_beat_the_catalogue(nats, error, share, simulated, chosen, expected):
+    gain = Gain(nats, error, nats / 150)
+    far = SimpleNamespace(beyond_catalogue=gain, rows=[{"F": share}], simulated_beyond=simulated)
     assert curves_beat(far, chosen) is expected
     assert curves_beat(SimpleNamespace(beyond_catalogue=None, rows=[]), chosen) is False
 

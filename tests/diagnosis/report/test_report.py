@@ -22,6 +22,7 @@ from ssmppl.diagnosis.report.words import (
     listed,
     next_steps,
     sentence,
+    simulated,
     undecided,
     where,
     which,
@@ -129,7 +130,8 @@ def test_of_many_rivals_some_are_named_and_the_rest_counted():
     ("name", "parts"),
     [
         ("effect_found", ["lacks one of these", "not distinguishable", "quadratic drag in v or "
-                          "state-dependent damping in v", "86%", "71% to 99%"]),
+                          "state-dependent damping in v", "simulations over 100 rows by 56%",
+                          "48% to 63%"]),
         ("none_of_these", ["is misspecified in the mean of v", "none of the 87 effects tried",
                            "62%", "41% to 83%", "p < 0.001"]),
         ("no_gap", ["No measurable gap", "none of the 87 effects", "p = 0.43"]),
@@ -150,7 +152,7 @@ def test_the_first_sentence_is_the_verdict_with_number_and_uncertainty(name, par
 
 def test_an_effect_that_gains_nothing_on_data_kept_back_is_said_so():
     report = effect_found()
-    lost = report.closed.assign(F=NAN, F_low=NAN, F_high=NAN)
+    lost = report.closed.dropna(subset=["F"]).assign(F=NAN, F_low=NAN, F_high=NAN)
     assert "too uncertain for a share" in headline(dataclasses.replace(report, closed=lost))
     stood_out = dataclasses.replace(no_gap(), causes=report.causes)
     assert "was significant (p < 0.001), but on held-out data" in headline(stood_out)
@@ -211,6 +213,32 @@ def test_how_far_says_what_moved_and_which_way():
     assert "made the predictions worse" in " ".join(how_far(worse))
     assert how_far(no_gap()) == ["On held-out data (t = 711 to 1000), log predictive density did "
                                  "not improve measurably."]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("share", "low", "high", "words"),
+    [
+        (0.4, 0.1, 0.6, "reduces the error of simulations over 100 rows by 40% (95% interval 10%"),
+        (-0.4, -0.6, -0.1, "increases the error of simulations over 100 rows by 40% (95% interval"),
+        (0.1, -0.1, 0.3, "does not measurably reduce the error of simulations over 100 rows (10%"),
+        (NAN, NAN, NAN, ""),
+    ],
+)
+def test_what_an_effect_does_to_simulations_is_told_with_its_uncertainty(share, low, high, words):
+    report = effect_found()
+    window = report.closed["horizon"] == "1 to 100"
+    closed = report.closed.copy()
+    closed.loc[window, ["share", "low", "high"]] = share, low, high
+    text = simulated(dataclasses.replace(report, closed=closed))
+    assert text.startswith(words)
+    assert bool(text) == bool(words)
+
+
+def test_errors_by_horizon_are_printed_and_none_where_nothing_is_missing():
+    text = str(effect_found())
+    assert re.search(r"10 +0\.101 +0\.062 +39% \(30% to 46%\) +0\.31", text)
+    assert re.search(r"free run +0\.213 +0\.094", text) is None  # of these runs no share is given
+    assert "rows ahead" not in str(no_gap())
 
 
 def test_the_curve_of_none_of_these_is_told_where_its_band_leaves_zero():

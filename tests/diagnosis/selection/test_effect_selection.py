@@ -9,6 +9,8 @@ import pytest
 from ssmppl.diagnosis import diagnose as diagnosis
 from ssmppl.diagnosis.effects import catalogue_sensor as ssm_effects
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.effects.catalogue import effects
+from ssmppl.diagnosis.effects.effect import CAUSES
 from ssmppl.diagnosis.model.scales import Scales, VariableScale
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
@@ -25,6 +27,7 @@ from ssmppl.diagnosis.selection.refit import (
     delays,
     leading,
     one_signed_candidates,
+    preferred,
 )
 from ssmppl.diagnosis.selection.refit_test import gain_p
 from ssmppl.inference.run.problem import missing_of, pose
@@ -290,14 +293,15 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
     def forward(self, out, most):
         taken.append(most)
         more = most - len(out.chosen.candidates)
-        out.chosen = replace(out.chosen, candidates=out.chosen.candidates + ("more",) * more)
+        out.chosen = replace(out.chosen, candidates=out.chosen.candidates + (effect,) * more)
 
-    one = Refit((0,), ("first",), None, None, 9.0)
+    effect = SimpleNamespace(effect=SimpleNamespace(cause="mechanism"))
+    one = Refit((0,), (effect,), None, None, 9.0)
     monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
     monkeypatch.setattr(EffectSelection, "_best_pair", lambda *_: None)
     monkeypatch.setattr(EffectSelection, "_forward", forward)
     screen = screen_of([6.0, 3.0], np.eye(2))
-    screen.design = SimpleNamespace(scales=None)
+    screen.design, screen.family.maxima = SimpleNamespace(scales=None), np.full(60, 2.0)
     out = SelectionResult(None)
     kept = Checkpoint(None, {})
     EffectSelection(
@@ -321,3 +325,65 @@ def test_a_fit_starts_where_the_data_are_likelier(monkeypatch, top, share):
     assert found == {"old": 3.0, "new": share}
     fitter.exact = True
     assert refits_of._backtracked(fitter, start, ["new"], (), seed_sequence(1)) == start
+
+
+# -- causes and descriptions of a misfit
+def refitted(cause, gain, ahead=0.0):
+    effect = SimpleNamespace(effect=SimpleNamespace(cause=cause))
+    return Refit((0,), (effect,), None, None, gain, 0.0, ahead)
+
+
+@pytest.mark.parametrize(
+    ("refits", "first"),
+    [
+        ([("mechanism", 617.0, 317.0), ("unknown input", 581.0, 390.0)], 0),  # a servo's friction
+        ([("mechanism", 9.0, 0.0), ("unknown input", 40.0, 0.0)], 1),  # it explains too little
+        ([("mechanism", 21.0, 0.0), ("unknown input", 40.0, 0.0)], 0),
+        ([("mechanism", 21.0, -15.0), ("unknown input", 40.0, 0.0)], 1),  # and nothing further on
+        ([("mechanism", 7.0, 0.0), ("unknown input", 12.0, 0.0)], 1),  # it may be chance
+        ([("noise law", 50.0, 0.0), ("unknown input", 40.0, 0.0), ("mechanism", 30.0, 0.0)], 2),
+        ([("noise law", 50.0, 0.0), ("change in time", 40.0, 0.0)], 1),
+        (
+            [("change in time", 33.0, 56.0), ("unknown input", 78.0, 72.0)],
+            1,
+        ),
+        ([("mechanism", 20.0, 5.0), ("mechanism", 22.0, 0.0)], 0),  # all horizons together
+        ([("unknown input", 20.0, 0.0), ("mechanism", 22.0, 0.0)], 1),
+    ],
+)
+def test_what_describes_a_misfit_comes_behind_a_cause_that_explains_it(refits, first):
+    made = [refitted(*r) for r in refits]
+    ordered = preferred(made, worth=8.0)
+    assert ordered[0] is made[first]
+    assert len(ordered) == len(made)
+
+
+@pytest.mark.parametrize(
+    ("cause", "gain", "ahead", "expected"),
+    [
+        ("mechanism", 20.0, 0.0, True),
+        ("mechanism", 20.0, -5.0, True),
+        ("mechanism", 20.0, -10.0, False),
+        ("mechanism", 266.0, -3.0, False),  # a delay beside a cubic spring
+        ("mechanism", 266.0, 60.0, True),
+        ("noise law", 20.0, -1.0, True),
+        ("noise law", 100.0, -67.0, False),  # as on a servo: simulations a third further off
+        ("unknown input", 100.0, 3.0, True),
+    ],
+)
+def test_a_further_effect_does_not_ruin_simulations(cause, gain, ahead, expected):
+    assert module._simulates(refitted(cause, gain, ahead), worth=8.0) is expected
+
+
+def test_every_effect_says_what_naming_it_means():
+    found = {(e.name, e.form): e.cause for e in effects}
+    assert set(found.values()) == set(CAUSES)
+    for name in ("coulomb friction", "sensor lag", "input delay", "coarse discretisation"):
+        assert {c for (n, _), c in found.items() if n == name} == {"mechanism"}
+    for name in ("parameter break", "parameter drift", "sensor drift", "level break",
+                 "wrong initial state", "periodic forcing"):  # fmt: skip
+        assert {c for (n, _), c in found.items() if n == name} == {"change in time"}
+    for name in ("missing input", "coloured noise", "parameter random walk"):
+        assert {c for (n, _), c in found.items() if n == name} == {"unknown input"}
+    for name in ("outliers", "heteroscedastic noise"):
+        assert {c for (n, _), c in found.items() if n == name} == {"noise law"}
