@@ -15,6 +15,7 @@ import numpy as np
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.effects.effect import NOISE_LAW, UNKNOWN_INPUT
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
@@ -268,7 +269,7 @@ class EffectSelection:
             best, gain=best.gain - single.gain, cost=best.cost - single.cost,
             ahead=best.ahead - single.ahead,
         )  # fmt: skip
-        enough = further.penalised_gain >= worth and _simulates(further, worth)
+        enough = further.penalised_gain >= worth and _simulates(further, best.candidates, worth)
         return best if enough else None
 
     def _forward(self, out: SelectionResult, most: int) -> None:
@@ -298,7 +299,10 @@ class EffectSelection:
             )  # fmt: skip
             worth, so_far = critical_gain(again, self.alpha), chosen.ahead
             more = [replace(r, ahead=r.ahead - so_far) for r in more]
-            more = [r for r in more if r.penalised_gain >= worth and _simulates(r, worth)]
+            more = [
+                r for r in more
+                if r.penalised_gain >= worth and _simulates(r, r.candidates[-1:], worth)
+            ]  # fmt: skip
             if not more:
                 return
             best = preferred(more, worth)[0]
@@ -340,10 +344,10 @@ def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | No
     return None
 
 
-def _simulates(r: Refit, worth: float) -> bool:
-    """Whether a further effect is one of a simulator, by what it gains beside those chosen: a cause
+def _simulates(r: Refit, new: Sequence[Candidate], worth: float) -> bool:
+    """Whether the effects `new` are of a simulator, by what they gain beside those chosen: a cause
     gains further ahead too, and what only describes a misfit loses next to nothing there."""
-    if r.describes:
+    if any(c.effect.cause in (UNKNOWN_INPUT, NOISE_LAW) for c in new):
         return r.score > 0.0 and r.ahead >= -worth
     return r.ahead >= CARRIES_ON * r.penalised_gain - worth
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, refine_wave, starts_of
-from ssmppl.diagnosis.effects.effect import ASKED, NOISE_LAW, UNKNOWN_INPUT
+from ssmppl.diagnosis.effects.effect import ASKED
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Stream, Task, child_seed
 from ssmppl.diagnosis.screening.efficient_score import Efficient
@@ -93,11 +93,6 @@ class Refit:
     def asked(self) -> int:
         """When its effect is asked, of several the one that is asked last (`ASKED`)."""
         return max((ASKED[c.effect.cause] for c in self.candidates), default=0)
-
-    @property
-    def describes(self) -> bool:
-        """Whether an effect of it only describes a misfit, and is no cause."""
-        return any(c.effect.cause in (UNKNOWN_INPUT, NOISE_LAW) for c in self.candidates)
 
     def simulated(
         self, train: Sequence[Experiment], numbers: Numbers, of_base: SimulationGain | None

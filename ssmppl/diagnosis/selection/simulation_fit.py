@@ -4,8 +4,9 @@ The likelihood looks one row ahead. There the noise of the states grows over wha
 takes from the other parameters what they would have to explain; a simulation started in the same
 state goes astray. With that noise held at a share of what was fitted, and all else fitted anew,
 what one row leaves unexplained is carried on to those that follow, as by an output error method
-(Ljung 1999, *System Identification*, on the choice of a noise model). So each model is fitted for a
-few shares, and has the parameters with which it simulates best.
+(Ljung 1999, *System Identification*, on the choice of a noise model). The parameters of the means
+are taken from there; those of the noises are fitted to them by the likelihood, so that the filter
+goes on following the data. Of a few shares each model has the one with which it simulates best.
 """
 
 from __future__ import annotations
@@ -57,33 +58,36 @@ def restored(
     """The one that had these numbers. fit : that of the likelihood."""
     share = float(numbers["share"])
     own = {n: numbers[f"simulation_{n}"] for n in NUMBERS}
-    quiet = _quieter(fitter, fit, share)
-    return SimulationFit(quiet, quiet.restored(train, own), share, numbers["ahead"])
+    if share < 1.0:
+        fitter = _with_means_of(
+            fitter, fitter.restored(train, fit.numbers | {"theta": own["theta"]})
+        )
+    return SimulationFit(fitter, fitter.restored(train, own), share, numbers["ahead"])
 
 
 def fit_for_simulation(
     fitter: Fitter, fit: Fit, train: Sequence[Experiment], of_base: SimulationGain
 ) -> SimulationFit:
-    """The fit with the share of process noise that simulates best. fit : that of the likelihood.
+    """The fit that simulates best. fit : that of the likelihood.
 
     of_base : horizons and random numbers, and by what gains are measured.
     """
-
-    def squares(f: Fitter, found: Fit) -> np.ndarray:
-        return of_base.mean_squares(f, found, train)
-
-    tried = [SimulationFit(fitter, fit, 1.0, squares(fitter, fit))]
+    tried = [SimulationFit(fitter, fit, 1.0, of_base.mean_squares(fitter, fit, train))]
     # Where a simulator is called each fit takes long.
-    names = [] if isinstance(fitter.smoother.extended, Extended) else _scales(fitter)
-    last = fit
+    called = isinstance(fitter.smoother.extended, Extended)
+    names, last = [] if called else _scales(fitter), fit
     for share in SHARES if names else ():
-        quiet = _quieter(fitter, fit, share)
+        quiet = fitter.with_fixed({n: share * fit.by_parameter[n] for n in names})
         start = {n: v for n, v in last.by_parameter.items() if n not in names}
         try:
             last = quiet.fit(train, of_base.seed, start, APPROXIMATELY)
+            held = _with_means_of(fitter, last)
+            own = {n: v for n, v in fit.by_parameter.items() if n not in held.fixed}
+            found = held.fit(train, of_base.seed, own, APPROXIMATELY)
         except SSMError:
             break
-        tried.append(SimulationFit(quiet, last, share, squares(quiet, last)))
+        squares = of_base.mean_squares(held, found, train)
+        tried.append(SimulationFit(held, found, share, squares))
     best = tried[0]
     for other in tried[1:]:
         if window_error(other.squares) < BETTER**2 * window_error(best.squares):
@@ -104,21 +108,24 @@ def gain_of_base(
     return replace(plain, before=best.squares), best
 
 
-def _quieter(fitter: Fitter, fit: Fit, share: float) -> Fitter:
-    """The fitter with the process noise held at a share of a fit's."""
-    if share == 1.0:
-        return fitter
+def _with_means_of(fitter: Fitter, fit: Fit) -> Fitter:
+    """The fitter with all parameters of the means held at those of a fit."""
     values = fit.by_parameter
-    return fitter.with_fixed({n: share * values[n] for n in _scales(fitter)})
+    return fitter.with_fixed({n: values[n] for n in _of_means(fitter) - set(fitter.fixed)})
+
+
+def _of_means(fitter: Fitter) -> set[str]:
+    """Parameters that the means of transitions or observations depend on."""
+    trace = fitter.problem.trace
+    means = component_means([*trace.transition.values(), *trace.observations.values()])
+    return {s.data[1] for s in symbols_of([*means.values()]) if s.data[0] == "parameter"}
 
 
 def _scales(fitter: Fitter) -> list[str]:
     """Parameters that scale the noise of transitions and do nothing else after the first row."""
-    gaussian, trace = fitter.problem.program.gaussian, fitter.problem.trace
-    if not isinstance(gaussian, GaussianApproximation):
+    trace = fitter.problem.trace
+    laws = [e for s in trace.observations.values() for e in s.distribution.expressions()]
+    used = {s.data[1] for s in symbols_of(laws) if s.data[0] == "parameter"}
+    if not isinstance(fitter.problem.program.gaussian, GaussianApproximation):
         return []
-    sites = trace.observations.values()
-    means = component_means(list(trace.transition.values())).values()
-    elsewhere = [*means, *(e for site in sites for e in site.distribution.expressions())]
-    used = {s.data[1] for s in symbols_of(elsewhere) if s.data[0] == "parameter"}
-    return sorted(fitter.process_noise_scales - used - set(fitter.fixed))
+    return sorted(fitter.process_noise_scales - used - _of_means(fitter) - set(fitter.fixed))

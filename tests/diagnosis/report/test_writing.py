@@ -12,7 +12,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.changed_laws import substituted
-from ssmppl.diagnosis.report.model_file import model_text, to_model
+from ssmppl.diagnosis.report.model_file import model_text, terms_with, to_model
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.expr import symbol
@@ -147,6 +147,14 @@ def test_vectors_and_matrices_keep_their_notation():
     assert "A @ x + b * u" in text
     assert "ssm.Normal(x, sd=r)" in text
     assert 'inputs={"force": 2}' in model_text(traced("features", "linear_vector"))
+
+
+def test_terms_of_an_effect_that_stand_in_several_equations_are_all_marked():
+    """They were compared as numbers, which have no truth while a model is traced."""
+    strength, x, y = (symbol("parameter", n, ()) for n in "sxy")
+    first, second = strength * x, strength * y
+    found = terms_with([first + y, second + first], strength)
+    assert [id(e) for e in found] == [id(first), id(second)]
 
 
 def test_hierarchies_of_priors_stay_in_order():

@@ -372,7 +372,8 @@ def test_what_describes_a_misfit_comes_behind_a_cause_that_explains_it(refits, f
     ],
 )
 def test_a_further_effect_does_not_ruin_simulations(cause, gain, ahead, expected):
-    assert module._simulates(refitted(cause, gain, ahead), worth=8.0) is expected
+    r = refitted(cause, gain, ahead)
+    assert module._simulates(r, r.candidates, worth=8.0) is expected
 
 
 def test_every_effect_says_what_naming_it_means():

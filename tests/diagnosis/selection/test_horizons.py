@@ -170,7 +170,9 @@ def test_the_fit_for_simulation_errs_less_where_noise_has_grown(spring_fit):
     assert fit.by_component["q"] > 0.01  # there is none
     gain, best = gain_of_base(augmented.base_fitter, fit, train, seed_sequence(3))
     assert best.share < 1.0
-    assert best.fit.by_component["q"] == pytest.approx(best.share * fit.by_component["q"])
+    # The noises are fitted to the other parameters, so that the filter follows the data.
+    assert best.fit.log_likelihood > fit.log_likelihood - 200.0
+    assert best.fit.by_component["k"] > fit.by_component["k"]
     plain, own = (gain.mean_squares(*m, train) for m in ((augmented.base_fitter, fit), best.model))
     assert np.all(own[-1] < 0.9 * plain[-1])
     assert gain.gain(gain.before) == 0.0
