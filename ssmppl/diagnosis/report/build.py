@@ -24,6 +24,7 @@ from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP
 from ssmppl.errors import SSMError
 from ssmppl.language.model.model import Model
+from ssmppl.language.model.trace import Trace
 
 MAX_ATTRIBUTES = 12  # causes whose attribute in an engine's file is looked up
 
@@ -60,6 +61,9 @@ def build_report(r: Results, seconds: float) -> GapReport:
         values = _estimates(r.chosen.fitter, r.chosen.fit)
         own = augment(r.trace, list(r.chosen.candidates)).parameter_symbols
         estimates["after"] = {repr(s): values[repr(s)] for s in own}
+        if r.chosen.simulating and r.chosen.simulating.share < 1.0:
+            there = r.chosen.simulator[1].by_component
+            estimates["simulation"] = {repr(s): (there[repr(s)], np.nan) for s in own}
         augmented, text = _written(r, r.chosen, notes)
     free = tabulate("free_run")
     if runs is not None:
@@ -169,19 +173,25 @@ def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None,
         added = augment(r.trace, list(chosen.candidates))
         if chosen.fitter.initial_law:
             added = chosen.fitter.initial_law.applied_to(added)
-        values = {n: v for n, v in chosen.fit.by_component.items() if n.split("[")[0] in
-                  added.parameters}  # fmt: skip
+        lines = _values("Fitted values:", chosen.fit, added)
+        if chosen.simulating and chosen.simulating.share < 1.0:
+            what = "Values with which it simulates many rows ahead best:"
+            lines += ["", *_values(what, chosen.simulator[1], added)]
         text = model_text(
-            added, title=f"{r.trace.name} with {names}",
-            notes=["Fitted values:", *(f"{n} = {v:.6g}" for n, v in values.items())],
-            added=chosen.candidates,
-        )  # fmt: skip
+            added, title=f"{r.trace.name} with {names}", notes=lines, added=chosen.candidates
+        )
         return to_model(added), text
     except SSMError as error:
         notes.append(f"the augmented model is not written: {error.found}")
     except Exception as error:
         r.failures.record("the augmented model", error)
     return None, ""
+
+
+def _values(title: str, fit: Fit, added: Trace) -> list[str]:
+    """Lines of the values of the model's own parameters."""
+    values = fit.by_component.items()
+    return [title, *(f"{n} = {v:.6g}" for n, v in values if n.split("[")[0] in added.parameters)]
 
 
 def _estimates(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:

@@ -36,7 +36,8 @@ HEADINGS = {
     "rmse_after": "error after", "p": "p", "horizon": "rows ahead", "share": "error reduced by",
     "low": "from", "high": "to",
 }  # fmt: skip
-MODELS = {"before": "original model", "after": "augmented model"}
+MODELS = {"before": "original model", "after": "augmented model",
+          "simulation": "the same, for simulation"}  # fmt: skip
 TABLES = {
     "causes": "All effects tried, best first",
     "classes": "Effects not distinguishable by these data",

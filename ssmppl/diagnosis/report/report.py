@@ -25,16 +25,21 @@ class GapReport(Findings):
     where : one row for each place that stands out, strongest first: the equation, the moment of
         its distribution (mean, scale, tails, time dependence), when (t_from, t_to), the region of
         states and inputs in words, z and its family-wise p.
-    causes : candidate effects, best first. `gain_screen` is the gain in nats that the score
+    causes : candidate effects, best first. `kind` says what naming it means: "mechanism", "change
+        in time", "unknown input" or "noise law". `gain_screen` is the gain in nats that the score
         predicts, `gain_refit` the one after refitting, NaN where it was not refitted; `sign` the
         constraint on the strength or the sign found, `estimate` and `se` that strength.
         Effects that these data cannot tell apart share a `class_id`.
     classes : the members of each class, their correlation `rho` with the best one, and in words
         the input that would separate them best ("" if none would).
-    closed : the chosen model first: share F of the reference model's gain on data that took
-        no part in choosing it, with a 95% interval (infinite ends where the data do not bound it;
-        F NaN where there is no measurable gap); the gain in nats per sample, and its parts in all
-        from the mean and from the noise distribution; the error of a free run before and after.
+    closed : what the chosen effects do on data that took no part in choosing them, a row for each
+        `horizon`: rows ahead of a filtered state ("10"), a window of them ("1 to 50"), or the "free
+        run" from the first row on. `rmse_before`, `rmse_after`, the `share` of the error that is
+        gone with a 95% interval `low`, `high`, and the gain in log predictive density a row,
+        `nats_per_sample`. The first row has besides the one-step share F of the reference model's
+        gain, with a 95% interval (infinite ends where the data do not bound it; F NaN where there
+        is no measurable gap), and the parts of that gain, in all, from the mean and from the noise
+        distribution; its `nats_per_sample` are of one row ahead.
     detection : tests of the one-step predictions by observation channel.
     residual_map : standardised smoothed score by equation and window of time.
     free_run : the data, and the models run without seeing them, before and after (NaN if there is
@@ -51,6 +56,8 @@ class GapReport(Findings):
     attributes : of a model that calls a physics engine, "effect in equation" -> which attribute of
         the engine's own file would carry it, and at what value.
     estimates : {"before": {parameter: (value, standard error)}, "after": ...}; error 0 if fixed.
+        "simulation" has those with which the augmented model simulates many rows ahead best, where
+        they are others, without errors.
     parts : {"screen": (first, last), "confirm": ...}, row labels of the rows that were used, or
         {"cross-fitting": number of blocks}; any further entry is text, such as "choice".
     notes : what has to be known before the figures are used.

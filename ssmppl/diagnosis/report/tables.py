@@ -175,7 +175,10 @@ def estimated_strength(
     that the screen tried. error : of the strength by the screen, about, where it is known."""
     strengths = {own.strength: v for own, v in zip(refit.candidates, refit.strengths, strict=True)}
     strength = strengths[c.strength]
-    if c.sided and (abs(strength) < AT_BOUND * error or c.strength in refit.bounds):
+    at_bound = c.strength in refit.bounds
+    if at_bound and np.isfinite(c.effect.upper) and strength > 0.5 * c.effect.upper:
+        return _strength_row(screen, c, strength, np.nan)
+    if c.sided and (abs(strength) < AT_BOUND * error or at_bound):
         return _strength_row(screen, c, 0.0, np.nan)  # the search runs towards the bound for ever
     return _strength_row(screen, c, strength, refit.errors[c.strength])
 

@@ -236,6 +236,7 @@ class EffectSelection:
         tests)."""
         found = {r.index[0]: gain_p(self.screen, r) for r in out.refits}
         if not found or min(found.values()) > CLOSER_LOOK_FACTOR * alpha:
+            out.p |= found
             return False
         if affordable(self.augmented, self.train):
             anew = one_signed_candidates(self.screen)  # fits to simulated data would take too long

@@ -12,11 +12,13 @@ from ssmppl.diagnosis.effects.catalogue_motion import (
     quadratic_drag,
     random_walk_load,
 )
+from ssmppl.diagnosis.effects.catalogue_sensor import sensor_rectification
 from ssmppl.diagnosis.report.tables import (
     _experiments,
     _when,
     bonferroni,
     causes_table,
+    estimated_strength,
     where_table,
 )
 from ssmppl.diagnosis.screening.location import localise
@@ -132,3 +134,14 @@ def test_a_stretch_over_experiments_is_said_with_both_ends():
     assert span(3, 9) == "t = 3 to 9"
     assert span(3, 9, "2") == "t = 3 to 9 of experiment 2"
     assert span(3, 9, "1 to 2") == "t = 3 of experiment 1 to t = 9 of experiment 2"
+
+
+@pytest.mark.parametrize(("strength", "shown"), [(1.0, 1.0), (0.98, 0.98), (1e-9, 0.0)])
+def test_a_strength_at_its_upper_bound_is_not_shown_as_none(strength, shown):
+    """The sensor of a belt's speed gives its size whole: the estimate runs to 1, and stood as 0."""
+    c = Candidate(sensor_rectification, "y", role="channel", strength="fold")
+    fit = SimpleNamespace(
+        candidates=(c,), strengths=[strength], bounds=["fold"], errors={"fold": np.nan}
+    )
+    row = estimated_strength(SimpleNamespace(experiments=[]), fit, c)
+    assert row["estimate"] == shown
