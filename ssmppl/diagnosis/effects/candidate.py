@@ -32,6 +32,7 @@ EDGE = 0.1  # share of the rows at either end where a break cannot be separated 
 LEAST_EDGE = 2  # rows at either end without a pulse
 DATED = ("step", "pulse")  # profiles that have a date
 SHORTEST = 4.0  # period in rows
+LEAST_TURNS = 2.0  # of a wave in a record
 WAVES = 100  # periods at most, the longest first
 PHASES = 3  # that are tried: a wave between two of them keeps three quarters of its nats
 
@@ -223,9 +224,10 @@ def dates(rows: int, profile: str) -> np.ndarray:
 
 
 def periods(rows: int) -> np.ndarray:
-    """Periods in rows: frequencies a half of the record's resolution apart, from one turn on."""
-    turns = np.arange(1.0, rows / SHORTEST, 0.5)[:WAVES]
-    return rows / turns if len(turns) else np.array([float(rows)])
+    """Periods in rows: frequencies a half of the record's resolution apart, from two turns on, as
+    what has not come again is no period."""
+    turns = np.arange(LEAST_TURNS, rows / SHORTEST, 0.5)[:WAVES]
+    return rows / turns if len(turns) else np.array([rows / LEAST_TURNS])
 
 
 def refine_wave(c: Candidate, column: np.ndarray, starts: Sequence[int], rows: int) -> Candidate:

@@ -34,6 +34,7 @@ class Choice(IntEnum):
     SHAPES = 7
     CHOSEN_SHAPES = 8
     SIMULATION = 9  # predictions further ahead of the model as it is
+    EXPLAINED = 10  # whether a cause explains what gained more
 
 
 class Task(IntEnum):

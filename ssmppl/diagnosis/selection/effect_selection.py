@@ -24,6 +24,7 @@ from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.fit import FROM_START, Fit
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import (
+    EXPLAINED,
     Refit,
     best_of_groups,
     correlated_candidates,
@@ -112,6 +113,8 @@ class EffectSelection:
             with guard("estimating shapes"):
                 out.refits = self._shaped(out, out.refits, Choice.SHAPES, "estimating shapes")
         out.refits = preferred(out.refits, critical_gain(self.screen, self.alpha))
+        with guard("whether the first explains what gains most"):
+            self._name_what_explains(out)
         out.chosen = out.refits[0]
         single, pair = out.chosen, None
         if self.most > 1:
@@ -252,6 +255,19 @@ class EffectSelection:
             return False
         out.p |= found
         return min(found.values()) <= alpha
+
+    def _name_what_explains(self, out: SelectionResult) -> None:
+        """A cause that was put before what gained more has to explain it: with the cause in the
+        model, that must not go on gaining most of what it gains alone. Else it is named."""
+        first, top = out.refits[0], max(out.refits, key=lambda r: r.score)
+        if first is top:
+            return
+        both, _ = self._refit(
+            out, out.base, self.screen, [(first.index[0], top.index[0])],
+            self._seed(Choice.EXPLAINED), "refitting the leading two together",
+        )  # fmt: skip
+        if both and both[0].score - first.score > (1.0 - EXPLAINED) * top.score:
+            out.refits = sorted(out.refits, key=lambda r: -r.score)
 
     # -- several effects
     def _best_pair(self, out: SelectionResult) -> Refit | None:

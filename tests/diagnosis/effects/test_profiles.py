@@ -6,6 +6,7 @@ import pytest
 from ssmppl.diagnosis.effects.candidate import (
     ALL_DATES,
     DATES,
+    LEAST_TURNS,
     PHASES,
     SHORTEST,
     WAVES,
@@ -72,11 +73,11 @@ def test_what_has_no_date_stays():
 
 @pytest.mark.parametrize("rows", [20, 100, 1000])
 def test_periods_leave_no_wave_unseen(rows):
-    """Of a wave of any period from `SHORTEST` (where all are tried) to the record's length and any
-    phase, some wave that is tried keeps half of the square of its correlation."""
+    """Of a wave of any period from `SHORTEST` (where all are tried) to half the record's length and
+    any phase, some wave that is tried keeps half of the square of its correlation."""
     found = periods(rows)
     assert len(found) <= WAVES
-    assert found[0] == rows
+    assert found[0] == rows / LEAST_TURNS
     assert found[-1] >= SHORTEST
     rng = np.random.default_rng(seed_of("periods", rows))
     t = np.arange(rows)
@@ -84,7 +85,7 @@ def test_periods_leave_no_wave_unseen(rows):
     tried = np.cos(2 * np.pi * t / found[:, None, None] - phases[:, None]).reshape(-1, rows)
     tried /= np.linalg.norm(tried, axis=1, keepdims=True)
     for _ in range(50):
-        frequency = rng.uniform(1.0 / rows, 1.0 / found[-1])
+        frequency = rng.uniform(LEAST_TURNS / rows, 1.0 / found[-1])
         wave = np.cos(2 * np.pi * frequency * t - rng.uniform(0, 2 * np.pi))
         assert np.max(np.abs(tried @ wave)) ** 2 >= 0.5 * wave @ wave
 

@@ -399,3 +399,31 @@ def test_p_of_every_refit_is_kept_where_none_stands_out(monkeypatch):
     choice = EffectSelection(None, None, (), seed_sequence(1), 0.05, Checkpoint(None, {}))
     assert choice._by_refit(out, 0.025) is False
     assert out.p == {0: 0.114, 1: 0.9}
+
+
+@pytest.mark.parametrize(
+    ("together", "first"),
+    [
+        (900.0, "mechanism"),  # 300 of 795 nats are left
+        (1100.0, "unknown input"),
+        (None, "mechanism"),  # the two could not be refitted
+    ],
+)
+def test_a_cause_comes_first_only_where_it_explains_what_gains_more(monkeypatch, together, first):
+    friction, wandering = refitted("mechanism", 500.0, 100.0), refitted("unknown input", 795.0)
+    both = [] if together is None else [refitted("unknown input", together)]
+    asked = []
+
+    def refit_all(augmented, base, screen, sets, *_, **__):
+        asked.append(sets)
+        return both, []
+
+    monkeypatch.setattr(module, "refit_all", refit_all)
+    out = SelectionResult(None, refits=[friction, replace(wandering, index=(1,))])
+    choice = EffectSelection(None, None, (), seed_sequence(1), 0.05, Checkpoint(None, {}))
+    choice._name_what_explains(out)
+    assert asked == [[(0, 1)]]
+    assert out.refits[0].candidates[0].effect.cause == first
+    out.refits = [wandering, friction]  # the one that gains most is first
+    choice._name_what_explains(out)
+    assert len(asked) == 1
