@@ -16,6 +16,7 @@ import numpy as np
 from ssmppl.diagnosis.report import words
 from ssmppl.diagnosis.report.findings import Findings
 from ssmppl.diagnosis.report.panels import TITLES, bars, curves, mapped, pictures, runs
+from ssmppl.diagnosis.report.text import AHEAD, horizon_rows
 from ssmppl.diagnosis.verdict.verdicts import NO_GAP, NONE_OF_THESE
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
 
@@ -93,6 +94,8 @@ li { margin: 0.35rem 0; }
 .verdict p { font-size: 1.22rem; line-height: 1.42; margin: 0; font-weight: 500; }
 .none-of-these { background: var(--open); border-color: #d55e00; }
 .no-measurable-gap { background: var(--quiet); border-color: var(--soft); }
+.first { margin-top: 1.2rem; }
+.first figure { margin-bottom: 0.6rem; }
 .cards { display: grid; gap: 0.8rem; margin-top: 0.9rem; }
 .card { background: var(--card); border: 1px solid var(--line); border-radius: 0.5rem;
   padding: 0.75rem 1rem; min-width: 0; }
@@ -112,6 +115,7 @@ summary { cursor: pointer; padding: 0.65rem 0; font-weight: 500; }
 .scroll { overflow-x: auto; margin-bottom: 0.8rem; }
 table { width: max-content; border-collapse: collapse; font-size: 0.88rem;
   font-variant-numeric: tabular-nums; }
+caption { text-align: left; font-weight: 600; padding-bottom: 0.3rem; }
 th, td { padding: 0.3rem 0.9rem 0.3rem 0; text-align: right; vertical-align: top;
   white-space: nowrap; border-bottom: 1px solid var(--line); }
 th { color: var(--soft); font-weight: 600; }
@@ -146,11 +150,15 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
     title = f"Diagnosis of {report.title}" if report.title else "Diagnosis of a model"
     kind = report.verdict.replace(" ", "-")
     # These first: what fails in them is among the parts left out.
-    evidence = _part(
-        report,
-        "the page's pictures",
-        lambda: _evidence(report, pictures(report) if wide is None else wide),
-    )
+    found: dict[str, str] = {}
+
+    def draw() -> str:
+        found.update(_figures(report, pictures(report) if wide is None else wide))
+        return ""
+
+    _part(report, "the page's pictures", draw)
+    first = found.pop("free_run", "")
+    opening = _part(report, "the page's first table", lambda: first + _by_horizon(report))
     tables = _part(report, "the page's tables", lambda: _section("Tables", _tables(report)))
     parts = [
         "<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
@@ -159,10 +167,11 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
         f"<header><h1>{_text(title)}</h1></header>",
         f'<section class="verdict {kind}" aria-label="The answer">',
         f"<p>{_text(words.headline(report))}</p>", "</section>",
+        f'<section class="first">{opening}</section>' if opening else "",
         _answers(report),
         _section("How sure", _list(words.how_sure(report)) + _unknown(report)),
         _section("Next steps", _list(words.next_steps(report))),
-        evidence,
+        _section("The evidence", "\n".join(found.values())),
         tables,
         _section("Glossary", _glossary()),
         _model(report),
@@ -246,17 +255,34 @@ def _unknown(report: Findings) -> str:
 
 
 # -- the pictures
-def _evidence(report: Findings, wide: dict[str, bytes]) -> str:
+def _figures(report: Findings, wide: dict[str, bytes]) -> dict[str, str]:
+    """Each panel with its title and what it shows."""
     narrow = pictures(report, PHONE)
-    body = "\n".join(
-        f"<figure><figcaption>{_text(TITLES[name])}</figcaption>\n"
+    return {
+        name: f"<figure><figcaption>{_text(TITLES[name])}</figcaption>\n"
         f'<picture><source media="(min-width: 46rem), print" srcset="{_png(wide[name])}">'
         f'<img src="{_png(narrow[name])}" alt="{_text(_alt(report, name))}"></picture>\n'
         f"<p>{_text(CAPTIONS[name])}</p></figure>"
         for name in narrow
         if name in wide
+    }
+
+
+def _by_horizon(report: Findings) -> str:
+    """The errors of simulations by horizon, open to the eye; nothing where none were measured."""
+    head, *body = horizon_rows(report)
+    if not body or report.verdict == NO_GAP:
+        return ""
+    keep = [i for i in range(len(head)) if any(row[i] for row in body)]
+    heads = "".join(f'<th scope="col">{_text(head[i])}</th>' for i in keep)
+    lines = "\n".join(
+        "<tr>" + "".join(f"<td>{_text(row[i])}</td>" for i in keep) + "</tr>" for row in body
     )
-    return _section("The evidence", body)
+    return (
+        f'\n<div class="scroll" tabindex="0" role="region" aria-label="{_text(AHEAD)}"><table>'
+        f"<caption>{_text(AHEAD)}</caption><thead><tr>{heads}</tr></thead>\n"
+        f"<tbody>\n{lines}\n</tbody></table></div>"
+    )
 
 
 def _alt(report: Findings, name: str) -> str:

@@ -40,14 +40,15 @@ def cause_rows(report: Findings, shown: int = SHOWN_CAUSES) -> list[tuple[str, .
 
 
 def horizon_rows(report: Findings) -> list[tuple[str, ...]]:
-    """Header and a line for each horizon: rows ahead, errors before and after, what is gained."""
-    out: list[tuple[str, ...]] = [("rows ahead", "", "error before", "after", "reduced by",
+    """Header and a line for each horizon: rows ahead, what is gained, errors before and after."""
+    out: list[tuple[str, ...]] = [("rows ahead", "", "reduced by", "error before", "after",
                                     "nats per row")]  # fmt: skip
     for r in words.rows(report.closed):
         ends = f" ({interval(r['low'], r['high'])})" if is_number(r["low"]) else ""
         if is_number(r["rmse_before"]) and is_number(r["share"]):
-            out.append((str(r["horizon"]), "", number(r["rmse_before"]), number(r["rmse_after"]),
+            out.append((str(r["horizon"]), "",
                         percent(r["share"]) + ends.replace("95% interval ", ""),
+                        number(r["rmse_before"]), number(r["rmse_after"]),
                         "" if r["horizon"] == FREE_RUN else number(r["nats_per_sample"], 2),
                         ))  # fmt: skip
     return out

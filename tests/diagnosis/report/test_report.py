@@ -236,7 +236,7 @@ def test_what_an_effect_does_to_simulations_is_told_with_its_uncertainty(share, 
 
 def test_errors_by_horizon_are_printed_and_none_where_nothing_is_missing():
     text = str(effect_found())
-    assert re.search(r"10 +0\.101 +0\.062 +39% \(30% to 46%\) +0\.31", text)
+    assert re.search(r"10 +39% \(30% to 46%\) +0\.101 +0\.062 +0\.31", text)
     assert re.search(r"free run +0\.213 +0\.094", text) is None  # of these runs no share is given
     assert "rows ahead" not in str(no_gap())
 
