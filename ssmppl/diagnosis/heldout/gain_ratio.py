@@ -9,7 +9,7 @@ Fieller's theorem (E. Fieller 1954), which says so where the denominator could b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -313,8 +313,9 @@ class HeldOutGain:
     """Rows of the report's table, free runs of each experiment before and after, and notes.
 
     beyond_catalogue : what the reference gains over the best of the catalogue, chosen or not.
-    simulated_beyond : by which share its simulations are better than those of what was chosen, and
-    the lower end of the interval; None where that was not measured.
+    simulated_beyond : the share of what it takes off the error of simulations that is left by what
+        was chosen, and the lower end of the interval of how much better than that it simulates;
+        None where that was not measured.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -424,10 +425,25 @@ class HeldOutRows:
         if self.simulation is not None:
             found_for = fit_for_simulation(*reference, self.split.train, self.simulation)
             with_curves = found_for.model
-        after_simulator, number = chosen.simulator if chosen else with_curves, sum(map(sum, counts))
+        after_simulator, number = (
+            chosen.simulator if chosen else with_curves,
+            int(sum(map(sum, counts))),
+        )
         ahead = compared(self.simulator, after_simulator, experiments, counts, which, seed)
-        out.rows += table_rows(label, which, ahead, int(number))
+        out.rows += table_rows(label, which, ahead, number)
         if chosen is not None and not same:
             beyond = compared(after_simulator, with_curves, experiments, counts, which[-1:], seed)
-            rows = table_rows(label, which[-1:], beyond, int(number))
-            out.simulated_beyond = (rows[0]["share"], rows[0]["low"]) if rows else None
+            out.simulated_beyond = _left(out.rows, table_rows(label, which[-1:], beyond, number))
+
+
+def _left(
+    rows: Sequence[Mapping[str, Any]], beyond: Sequence[Mapping[str, Any]]
+) -> tuple[float, float] | None:
+    """As of `HeldOutGain.simulated_beyond`. rows : those of what was chosen, the windows last;
+    beyond : the reference against it."""
+    if not beyond or rows[-1]["horizon"] != beyond[-1]["horizon"]:
+        return None
+    chosen = 1.0 - rows[-1]["share"]  # of the error of the model as it was
+    reference = chosen * (1.0 - beyond[-1]["share"])
+    left = (chosen - reference) / (1.0 - reference) if reference < 1.0 else 0.0
+    return left, beyond[-1]["low"]

@@ -125,8 +125,8 @@ class EffectSelection:
             if self.further:
                 with guard("whether a second effect is missing"):
                     self._forward(out, 2)
-            if rival is not None and rival.score > out.chosen.score:
-                out.chosen = rival
+            if rival is not None:
+                out.chosen = self._better(out.chosen, rival)
             if len(out.chosen.candidates) == 2 and self.further:
                 pair = out.chosen
                 with guard("whether a third effect is missing"):
@@ -257,10 +257,11 @@ class EffectSelection:
         return min(found.values()) <= alpha
 
     def _name_what_explains(self, out: SelectionResult) -> None:
-        """A cause that was put before what gained more has to explain it: with the cause in the
-        model, that must not go on gaining most of what it gains alone. Else it is named."""
+        """A cause that was put before what gained more has to simulate as well, or to explain it:
+        with the cause in the model, that must not go on gaining most of what it gains alone. Else
+        it is named."""
         first, top = out.refits[0], max(out.refits, key=lambda r: r.score)
-        if first is top:
+        if first.ahead >= top.ahead:
             return
         both, _ = self._refit(
             out, out.base, self.screen, [(first.index[0], top.index[0])],
@@ -270,6 +271,13 @@ class EffectSelection:
             out.refits = sorted(out.refits, key=lambda r: -r.score)
 
     # -- several effects
+    def _better(self, chosen: Refit, rival: Refit) -> Refit:
+        """Of two choices the one that gains more; of two of as many effects the one of causes,
+        where the other describes."""
+        if len(chosen.candidates) == len(rival.candidates):
+            return preferred([chosen, rival], critical_gain(self.screen, self.alpha))[0]
+        return max(chosen, rival, key=lambda r: r.score)
+
     def _best_pair(self, out: SelectionResult) -> Refit | None:
         """The best of the pairs of which the screen promises most, where it is clearly better than
         the best single one."""

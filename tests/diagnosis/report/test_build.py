@@ -8,7 +8,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
-from ssmppl.diagnosis.heldout.gain_ratio import Gain, gain_ratio
+from ssmppl.diagnosis.heldout.gain_ratio import Gain, _left, gain_ratio
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.report import build, tables
 from ssmppl.diagnosis.report.words import headline
@@ -39,6 +39,23 @@ def test_curves_beat_the_catalogue(nats, error, share, simulated, chosen, expect
     far = SimpleNamespace(beyond_catalogue=gain, rows=[{"F": share}], simulated_beyond=simulated)
     assert curves_beat(far, chosen) is expected
     assert curves_beat(SimpleNamespace(beyond_catalogue=None, rows=[]), chosen) is False
+
+
+@pytest.mark.parametrize(
+    ("after", "reference", "left"),
+    [
+        (0.0003, 0.0002, 0.1 / 2.8),  # next to nothing of what can be taken off
+        (0.0020, 0.0010, 0.5),
+        (0.0030, 0.0030, 0.0),
+        (0.0030, 0.0040, 0.0),  # the reference simulates worse than nothing
+    ],
+)
+def test_what_is_left_is_a_share_of_what_curves_take_off(after, reference, left):
+    rows = [{"horizon": "10", "share": 0.1}, {"horizon": "1 to 25", "share": 1 - after / 0.003}]
+    beyond = [{"horizon": "1 to 25", "share": 1 - reference / after, "low": 0.1}]
+    assert _left(rows, beyond) == pytest.approx((left, 0.1))
+    assert _left(rows[:1], beyond) is None
+    assert _left(rows, []) is None
 
 
 # -- a verdict agrees with the checks

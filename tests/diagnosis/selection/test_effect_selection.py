@@ -410,7 +410,8 @@ def test_p_of_every_refit_is_kept_where_none_stands_out(monkeypatch):
     ],
 )
 def test_a_cause_comes_first_only_where_it_explains_what_gains_more(monkeypatch, together, first):
-    friction, wandering = refitted("mechanism", 500.0, 100.0), refitted("unknown input", 795.0)
+    friction = refitted("mechanism", 500.0, 100.0)
+    wandering = refitted("unknown input", 595.0, 200.0)
     both = [] if together is None else [refitted("unknown input", together)]
     asked = []
 
@@ -426,4 +427,19 @@ def test_a_cause_comes_first_only_where_it_explains_what_gains_more(monkeypatch,
     assert out.refits[0].candidates[0].effect.cause == first
     out.refits = [wandering, friction]  # the one that gains most is first
     choice._name_what_explains(out)
+    simulates = refitted("mechanism", 300.0, 250.0)  # better than what gains most
+    out.refits = [simulates, wandering]
+    choice._name_what_explains(out)
+    assert out.refits[0] is simulates
     assert len(asked) == 1
+
+
+def test_two_causes_come_before_a_cause_and_a_description(monkeypatch):
+    """Friction and a load, beside friction and an input that wanders, of a servo."""
+    monkeypatch.setattr(module, "critical_gain", lambda *_: 8.0)
+    choice = EffectSelection(None, None, (), seed_sequence(1), 0.05, Checkpoint(None, {}))
+    load, wandering = refitted("mechanism", 400.0), refitted("unknown input", 600.0)
+    assert choice._better(load, wandering) is load
+    assert choice._better(refitted("mechanism", 200.0), wandering) is wandering
+    one_more = replace(wandering, candidates=wandering.candidates * 2)
+    assert choice._better(load, one_more) is one_more
