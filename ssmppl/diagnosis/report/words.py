@@ -388,6 +388,11 @@ def _curve_peak(report: Findings) -> str:
     return f"{text} (95% band {number(top['low'])} to {number(top['high'])})."
 
 
+def _subject(row: dict[str, Any]) -> str:
+    """What a row of `closed` is about, as the subject of a sentence."""
+    return f"a model with {CURVES}" if row["effect"] == CURVES else str(row["effect"])
+
+
 def how_far(report: Findings) -> list[str]:
     """Share of the reference's gain, the gain per sample, and the error of a free run."""
     if report.mode == "fast":
@@ -398,17 +403,17 @@ def how_far(report: Findings) -> list[str]:
     if not closed:
         return ["Not measured."]
     first, out = closed[0], []
-    told = simulated(report)
+    told = simulated(report) if report.verdict != NO_GAP else ""
     if told:
         r = windows(report) or {}
         ends = f"{number(r['rmse_before'])} to {number(r['rmse_after'])}"
         out.append(
-            sentence(f"{kept_back(report)}, {first['effect']} {told}: from {ends} (RMS, units of "
+            sentence(f"{kept_back(report)}, {_subject(first)} {told}: from {ends} (RMS, units of "
                      "the data). Each simulation starts in the state that the model's filter has "
                      "for its first row, and does not see the data again")
         )  # fmt: skip
     if is_number(first["F"]):
-        own = f"{kept_back(report)}, {first['effect']}" if not told else "it"
+        own = "it" if told else f"{kept_back(report)}, {_subject(first)}"
         out.append(sentence(f"{own} {share(report)}"))
         if first["F"] < 0:
             out.append("A share below zero means that it made the predictions worse.")
