@@ -320,10 +320,10 @@ class HeldOutGain:
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     beyond_catalogue: Gain | None = None
-    simulated_beyond: tuple[float, float] | None = None
     before: list[FreeRun] = field(default_factory=list)
     after: list[FreeRun] | None = None
     notes: list[str] = field(default_factory=list)
+    simulated_beyond: tuple[float, float] | None = None
 
     def simulate(
         self, base: tuple[Fitter, Fit], experiments: Sequence[Experiment], chosen: Refit | None,

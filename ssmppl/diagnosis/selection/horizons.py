@@ -170,7 +170,8 @@ class SimulationGain:
 
     horizons : that count. window : rows of the simulations that the report leads with. rows : (K,)
     measured rows of each channel. before : (H + 1, K) mean squares of the model as it is, the last
-    row those of the windows. seed : of the simulations, the same for all models.
+    row those of the windows. seed : of the simulations, the same for all models. origins : of these
+    at most, where a simulator allows few.
     """
 
     horizons: tuple[int, ...]
@@ -178,6 +179,7 @@ class SimulationGain:
     rows: np.ndarray
     before: np.ndarray
     seed: np.random.SeedSequence
+    origins: float = np.inf
 
     @classmethod
     def of(
@@ -189,7 +191,9 @@ class SimulationGain:
         rows = np.sum([(e.seen == 1.0).sum(axis=0) for e in train], axis=0)
         nothing = np.full((len(horizons) + 1, len(rows)), np.nan)
         reach = min(window or max(1, round(WINDOW * longest)), max(longest // 2, 1))
-        out = cls(horizons, reach, rows, nothing, seed)
+        called = isinstance(fitter.smoother.extended, Extended)
+        origins = float(ORIGINS_CALLED * len(train)) if called else np.inf
+        out = cls(horizons, reach, rows, nothing, seed, origins)
         return replace(out, before=out.mean_squares(fitter, fit, train))
 
     def gain(self, after: np.ndarray) -> float:
@@ -201,7 +205,7 @@ class SimulationGain:
             ratio = before / after
         ratio = np.where(np.isnan(ratio), 1.0, ratio)  # not measured, or astray before and after
         ratio = np.clip(ratio, 1.0 / LARGEST_RATIO, LARGEST_RATIO)
-        share = self.rows / (2.0 * np.array(self.horizons)[:, None])
+        share = np.minimum(self.rows / np.array(self.horizons)[:, None], self.origins) / 2.0
         return float(np.sum(share * np.log(ratio)))
 
     def mean_squares(self, fitter: Fitter, fit: Fit, train: Sequence[Experiment]) -> np.ndarray:

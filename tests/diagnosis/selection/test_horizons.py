@@ -112,6 +112,7 @@ def test_the_gain_counts_one_in_so_many_rows():
     assert gain.gain(after) == pytest.approx(90 / 6 * np.log(2))
     after = np.array([[1.0, 4.0], [1.0, np.nan], window])
     assert gain.gain(after) == pytest.approx(90 / 20 * np.log(2))
+    assert replace(gain, origins=8.0).gain(after) == pytest.approx(8 / 2 * np.log(2))
     astray = np.full((3, 2), np.inf)
     largest = np.log(module.LARGEST_RATIO)
     assert gain.gain(astray) == pytest.approx(-(150 / 6 + 90 / 20) * largest)
