@@ -79,6 +79,7 @@ def test_a_jump_is_found_with_its_date_and_size(jump):
 def test_the_share_is_of_rows_left_out(jump):
     row, *ahead = jump.closed.to_dict("records")
     assert row["horizon"] == "free run"
+    assert ahead[-1]["horizon"].startswith("1 to ")
     assert all(r["rmse_before"] > 0.0 for r in ahead)
     assert row["effect"] == "level break"
     # With five folds of which one holds the break, the reference's own gain may be uncertain.
@@ -268,6 +269,7 @@ def test_any_model_is_screened(case):
         ({"mode": "quick"}, "mode='quick'"),
         ({"alpha": 0.0}, "alpha=0.0"),
         ({"particles": 3}, "particles=3"),
+        ({"horizon": 0}, "horizon=0"),
         ({"effects": ["level brake"]}, "level brake"),
         ({"effects": ["input delay"]}, "none of the effects applies"),
         ({"fixed": {"mass": 1.0}}, "mass"),

@@ -67,6 +67,9 @@ def test_friction_is_named_before_an_unknown_input_and_simulations_improve(tmp_p
     assert report.chosen[0].startswith(first["effect"])
     window = report.closed.set_index("horizon").loc["1 to 25"]
     assert window["low"] > 0.5
+    # Its own parameters for that are handed back beside those of the likelihood.
+    assert set(report.estimates["simulation"]) == set(report.estimates["after"])
+    assert "simulates many rows ahead best" in report.model_text
     # What an input that wanders gains one row ahead it does not gain in simulations.
     assert "missing input" in set(report.causes["effect"])
     report.save(tmp_path)

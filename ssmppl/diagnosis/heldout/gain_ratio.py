@@ -420,19 +420,33 @@ class HeldOutRows:
             label, ratio, ratio.gain.nats_per_sample, gain_of_mean(plain, found),
             (before_error, after_error), chosen is not None,
         )  # fmt: skip
+        try:
+            self._look_ahead(out, label, reference, seed, same)
+        except SSMError as error:
+            out.notes.append(f"held-out rows could not be simulated: {error.found}")
+
+    def _look_ahead(
+        self, out: HeldOutGain, label: str, reference: tuple[Fitter, Fit],
+        seed: np.random.SeedSequence, same: bool,
+    ) -> None:  # fmt: skip
+        """Errors of simulations by horizon, and what the reference takes off them beyond what was
+        chosen, into `out`. same : the reference is the chosen model.
+
+        Raises
+        ------
+        SSMError : a filter fails at one of the fits.
+        """
+        experiments, counts = self.split.experiments, self.split.held_out
         which = horizons(experiments, counts, self.horizon)
         with_curves = reference
         if self.simulation is not None:
-            found_for = fit_for_simulation(*reference, self.split.train, self.simulation)
-            with_curves = found_for.model
-        after_simulator, number = (
-            chosen.simulator if chosen else with_curves,
-            int(sum(map(sum, counts))),
-        )
-        ahead = compared(self.simulator, after_simulator, experiments, counts, which, seed)
+            with_curves = fit_for_simulation(*reference, self.split.train, self.simulation).model
+        after = self.chosen.simulator if self.chosen else with_curves
+        ahead = compared(self.simulator, after, experiments, counts, which, seed)
+        number = int(sum(c.sum() for c in counts))
         out.rows += table_rows(label, which, ahead, number)
-        if chosen is not None and not same:
-            beyond = compared(after_simulator, with_curves, experiments, counts, which[-1:], seed)
+        if self.chosen is not None and not same:
+            beyond = compared(after, with_curves, experiments, counts, which[-1:], seed)
             out.simulated_beyond = _left(out.rows, table_rows(label, which[-1:], beyond, number))
 
 

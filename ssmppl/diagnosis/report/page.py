@@ -16,7 +16,7 @@ import numpy as np
 from ssmppl.diagnosis.report import words
 from ssmppl.diagnosis.report.findings import Findings
 from ssmppl.diagnosis.report.panels import TITLES, bars, curves, mapped, pictures, runs
-from ssmppl.diagnosis.report.text import AHEAD, horizon_rows
+from ssmppl.diagnosis.report.text import AHEAD, filled, horizon_rows
 from ssmppl.diagnosis.verdict.verdicts import NO_GAP, NONE_OF_THESE
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
 
@@ -150,14 +150,10 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
     title = f"Diagnosis of {report.title}" if report.title else "Diagnosis of a model"
     kind = report.verdict.replace(" ", "-")
     # These first: what fails in them is among the parts left out.
-    found: dict[str, str] = {}
-
-    def draw() -> str:
-        found.update(_figures(report, pictures(report) if wide is None else wide))
-        return ""
-
-    _part(report, "the page's pictures", draw)
-    first = found.pop("free_run", "")
+    figures: dict[str, str] = {}
+    with report.failures.guard("the page's pictures"):
+        figures = _figures(report, pictures(report) if wide is None else wide)
+    first = figures.pop("free_run", "")
     opening = _part(report, "the page's first table", lambda: first + _by_horizon(report))
     tables = _part(report, "the page's tables", lambda: _section("Tables", _tables(report)))
     parts = [
@@ -171,7 +167,7 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
         _answers(report),
         _section("How sure", _list(words.how_sure(report)) + _unknown(report)),
         _section("Next steps", _list(words.next_steps(report))),
-        _section("The evidence", "\n".join(found.values())),
+        _section("The evidence", "\n".join(figures.values())),
         tables,
         _section("Glossary", _glossary()),
         _model(report),
@@ -270,13 +266,12 @@ def _figures(report: Findings, wide: dict[str, bytes]) -> dict[str, str]:
 
 def _by_horizon(report: Findings) -> str:
     """The errors of simulations by horizon, open to the eye; nothing where none were measured."""
-    head, *body = horizon_rows(report)
+    head, *body = filled(horizon_rows(report))
     if not body or report.verdict == NO_GAP:
         return ""
-    keep = [i for i in range(len(head)) if any(row[i] for row in body)]
-    heads = "".join(f'<th scope="col">{_text(head[i])}</th>' for i in keep)
+    heads = "".join(f'<th scope="col">{_text(cell)}</th>' for cell in head)
     lines = "\n".join(
-        "<tr>" + "".join(f"<td>{_text(row[i])}</td>" for i in keep) + "</tr>" for row in body
+        "<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in body
     )
     return (
         f'\n<div class="scroll" tabindex="0" role="region" aria-label="{_text(AHEAD)}"><table>'

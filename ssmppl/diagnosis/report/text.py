@@ -54,6 +54,12 @@ def horizon_rows(report: Findings) -> list[tuple[str, ...]]:
     return out
 
 
+def filled(cells: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """A table, header first, without the columns in which nothing stands."""
+    keep = [i for i in range(len(cells[0])) if any(row[i] for row in cells[1:])]
+    return [tuple(row[i] for i in keep) for row in cells]
+
+
 def _table(cells: list[tuple[str, ...]]) -> list[str]:
     """Columns side by side: the first two to the left, numbers to the right; forms cut to fit."""
     keep = [i for i in range(len(cells[0])) if any(row[i] for row in cells[1:])]
@@ -106,12 +112,10 @@ def report_html(report: Findings) -> str:
         if sentences
     ]
     parts.append(markup.table(rows_of_answers, left=(0, 1)))
-    head, *ahead = horizon_rows(report)
+    head, *ahead = filled(horizon_rows(report))
     if ahead and report.verdict != NO_GAP:
-        keep = [i for i in range(len(head)) if any(row[i] for row in ahead)]
         parts.append(markup.paragraph(AHEAD))
-        parts.append(markup.table([[markup.text(row[i]) for i in keep] for row in ahead],
-                                  [head[i] for i in keep], [0]))  # fmt: skip
+        parts.append(markup.table([list(map(markup.text, row)) for row in ahead], head, [0]))
     head, *causes = cause_rows(report)
     if causes:
         keep = [i for i in range(len(head)) if any(row[i] for row in causes)]

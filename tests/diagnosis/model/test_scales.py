@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ssmppl.diagnosis.effects.effect import means, quantiles, sds, sizes
+from ssmppl.diagnosis.effects.catalogue import effects
+from ssmppl.diagnosis.effects.effect import firsts, means, quantiles, sds, sizes
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.scales import DIGITS, LEVELS, Scales, VariableScale, value_of
 from ssmppl.language.tracing import trace
@@ -46,3 +47,14 @@ def test_thresholds_far_from_zero_are_different_effects():
     assert len(found) == len(near) > 4
     assert len({c.shape for c in found}) == len({c.shape for c in near})
     assert len({c.key for c in found}) == len({str(c) for c in found}) == len(found)
+
+
+def test_a_lag_begins_where_the_sensor_does():
+    """At the mean of a record that rises, its strength came out as a fraction of what it is."""
+    readings = np.r_[np.nan, 23.8, np.linspace(24.0, 60.0, 50)]
+    scale = VariableScale.of(readings)
+    assert scale.first == 23.8
+    assert value_of(firsts(1.0), 1.0, scale, 100) == 23.8
+    for name in ("sensor lag", "sensor delay"):
+        (effect,) = effects.get(name)
+        assert effect.shapes["start"].unit == "first"

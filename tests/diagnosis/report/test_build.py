@@ -8,7 +8,9 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
-from ssmppl.diagnosis.heldout.gain_ratio import Gain, _left, gain_ratio
+from ssmppl.diagnosis.heldout import gain_ratio as gain_ratio_module
+from ssmppl.diagnosis.heldout.gain_ratio import Gain, HeldOutGain, HeldOutRows, _left, gain_ratio
+from ssmppl.diagnosis.heldout.simulation import Horizon
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.report import build, tables
 from ssmppl.diagnosis.report.words import headline
@@ -56,6 +58,25 @@ def test_what_is_left_is_a_share_of_what_curves_take_off(after, reference, left)
     assert _left(rows, beyond) == pytest.approx((left, 0.1))
     assert _left(rows[:1], beyond) is None
     assert _left(rows, []) is None
+
+
+def test_simulations_of_the_model_as_it_was_stand_beside_those_with_the_effect(monkeypatch):
+    rows, asked = np.array([[1.0, 0.25, 0.1]] * 8), []
+
+    def compared(before, after, *_):
+        asked.append((before, after))
+        return [rows]
+
+    monkeypatch.setattr(gain_ratio_module, "compared", compared)
+    monkeypatch.setattr(gain_ratio_module, "horizons", lambda *_: [Horizon(5, window=True)])
+    held = SimpleNamespace(experiments=(), held_out=[np.ones(9, bool)])
+    chosen = SimpleNamespace(simulator="with the effect")
+    at = HeldOutRows(None, held, "fitted", None, chosen, None, "as it was")
+    out = HeldOutGain()
+    at._look_ahead(out, "drag", "with curves", None, same=False)
+    assert asked == [("as it was", "with the effect"), ("with the effect", "with curves")]
+    assert out.rows[0]["share"] == 0.5
+    assert out.simulated_beyond is not None
 
 
 # -- a verdict agrees with the checks

@@ -234,6 +234,11 @@ def test_what_an_effect_does_to_simulations_is_told_with_its_uncertainty(share, 
     assert bool(text) == bool(words)
 
 
+def test_nothing_is_told_of_simulations_where_no_gap_is_measurable():
+    report = dataclasses.replace(no_gap(), closed=effect_found().closed)
+    assert "simulations" not in " ".join(how_far(report))
+
+
 def test_errors_by_horizon_are_printed_and_none_where_nothing_is_missing():
     text = str(effect_found())
     assert re.search(r"10 +39% \(30% to 46%\) +0\.101 +0\.062 +0\.31", text)

@@ -20,6 +20,8 @@ from ssmppl.diagnosis.selection import effect_selection as module
 from ssmppl.diagnosis.selection import refit as refits_of
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
+from ssmppl.diagnosis.selection.equivalence import _of_the_best
+from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import (
     Refit,
     best_of_groups,
@@ -443,3 +445,78 @@ def test_two_causes_come_before_a_cause_and_a_description(monkeypatch):
     assert choice._better(refitted("mechanism", 200.0), wandering) is wandering
     one_more = replace(wandering, candidates=wandering.candidates * 2)
     assert choice._better(load, one_more) is one_more
+
+
+def choice_of(screen=None, **augmented):
+    return EffectSelection(
+        SimpleNamespace(**augmented), screen, (), seed_sequence(1), 0.05, Checkpoint(None, {})
+    )
+
+
+@pytest.mark.parametrize(("ahead", "taken"), [(96.0, True), (80.0, False), (130.0, True)])
+def test_a_step_forward_counts_what_it_adds(monkeypatch, ahead, taken):
+    """Refits beside those chosen tell what all of them gain many rows ahead."""
+    effect = SimpleNamespace(effect=SimpleNamespace(cause="mechanism"), key="new")
+    chosen = replace(
+        refitted("mechanism", 50.0, 100.0), fitter=SimpleNamespace(exact=True), candidates=(effect,)
+    )
+    more = replace(refitted("mechanism", 20.0, ahead), candidates=(effect, effect))
+    again = SimpleNamespace(
+        family=SimpleNamespace(p=np.array([0.001])), design=SimpleNamespace(candidates=[effect])
+    )
+    monkeypatch.setattr(module, "_others", lambda *_: [effect])
+    monkeypatch.setattr(module, "leading", lambda *_: [0])
+    monkeypatch.setattr(module, "critical_gain", lambda *_: 8.0)
+    monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([more], []))
+    monkeypatch.setattr(EffectSelection, "_screen_again", lambda *_: again)
+    screen = SimpleNamespace(design=SimpleNamespace(candidates=[effect]))
+    out = SelectionResult(None, chosen=chosen)
+    choice_of(screen, settings=SimpleNamespace(particles=1))._forward(out, 2)
+    assert (len(out.chosen.candidates) == 2) is taken
+    if taken:
+        assert (out.chosen.gain, out.chosen.ahead) == (70.0, ahead)
+
+
+@pytest.mark.parametrize(("ahead", "taken"), [(90.0, False), (110.0, True)])
+def test_a_pair_counts_what_it_adds_to_the_single_effect(monkeypatch, ahead, taken):
+    single, pair = refitted("mechanism", 50.0, 100.0), refitted("mechanism", 80.0, ahead)
+    monkeypatch.setattr(module, "pairs", lambda *_: [(0, 1)])
+    monkeypatch.setattr(module, "critical_gain", lambda *_: 8.0)
+    monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([pair], []))
+    out = SelectionResult(None, refits=[single])
+    assert choice_of()._best_pair(out) is (pair if taken else None)
+
+
+def test_what_a_better_place_for_the_model_simulates_is_no_gain_of_an_effect(monkeypatch):
+    def gain(before):
+        return SimulationGain((3,), 5, np.array([60]), np.array(before), seed_sequence(1))
+
+    place = SimpleNamespace(log_likelihood=10.0, error=0.0)
+    fitter = SimpleNamespace(
+        fit=lambda *_: SimpleNamespace(numbers={"theta": np.zeros(1)}), restored=lambda *_: place
+    )
+    monkeypatch.setattr(module, "critical_gain", lambda *_: 8.0)
+    better = gain([[0.5], [1.0]])
+    monkeypatch.setattr(EffectSelection, "_simulation", lambda *_: (better, None))
+    one = replace(refitted("mechanism", 30.0, 40.0), fit=SimpleNamespace(by_parameter={}))
+    base = SimpleNamespace(log_likelihood=0.0, error=0.0)
+    out = SelectionResult(base, refits=[one], simulation=gain([[1.0], [1.0]]))
+    choice_of(base_fitter=fitter, trace=SimpleNamespace(parameters={}))._refit_base(out)
+    assert out.rebased
+    assert out.refits[0].gain == 20.0
+    assert out.refits[0].ahead == pytest.approx(40.0 - 60 / 6 * np.log(2))
+
+
+def test_shapes_of_one_effect_are_ranked_by_all_horizons():
+    screen = SimpleNamespace(groups=np.array([0, 0, 1]))
+    likely, simulates, other = (
+        replace(refitted("mechanism", *v), index=(k,))
+        for k, v in enumerate([(10.0, 0.0), (8.0, 20.0), (1.0, 1.0)])
+    )
+    assert best_of_groups(screen, [likely, simulates, other]) == [simulates, other]
+
+
+def test_what_was_passed_over_is_no_rival():
+    gains, rho = np.array([10.0, 14.0, 9.5]), np.eye(3)
+    found = _of_the_best(rho, gains, np.zeros(3, int), 3, np.ones(3, bool))
+    assert found.tolist() == [True, False, True]

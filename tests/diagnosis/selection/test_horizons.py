@@ -91,6 +91,28 @@ def test_rows_that_do_not_count_and_values_that_are_missing_are_left_out():
     assert len(none.square) == 0
 
 
+def test_what_lies_behind_the_rows_that_count_does_not_count():
+    fitter, fit, experiments = fitted(walk(), walks(60, 1, "behind"), {"q": Q, "r": R})
+    rows = np.arange(60)
+    found = look_ahead(fitter, fit, experiments, [(rows >= 30) & (rows < 50)], 12, seed_sequence(2))
+    assert len(found.at(1).square) == 20  # from rows 29 to 48 on
+    assert len(found.at(10).square) == 11  # from rows 29 to 39 on
+
+
+def test_simulations_begin_when_the_filter_knows_the_state(monkeypatch):
+    fitter, fit, experiments = fitted(walk(), walks(200, 1, "settled"), {"q": Q, "r": R})
+    asked, simulate = [], module.samples_ahead
+
+    def watched(*args):
+        asked.append(args[7])
+        return simulate(*args)
+
+    monkeypatch.setattr(module, "samples_ahead", watched)
+    look_ahead(fitter, fit, experiments, every(experiments), 3, seed_sequence(2))
+    assert asked[0][0] == 200 * module.SETTLING
+    assert asked[0][-1] == 198
+
+
 def test_a_simulation_that_goes_astray_is_infinitely_far_off():
     samples = np.zeros((2, 1, 1, 4))
     samples[0, 0, 0, 1] = np.inf
@@ -211,6 +233,21 @@ def test_a_kept_fit_is_restored(spring_fit):
     np.testing.assert_array_equal(*at)
 
 
+def test_the_share_that_gains_most_ranks_and_the_one_with_the_least_error_simulates(
+    spring_fit, monkeypatch
+):
+    augmented, fit, train = spring_fit
+    gain, _ = gain_of_base(augmented.base_fitter, fit, train, seed_sequence(3))
+    gain = replace(gain, before=np.ones_like(gain.before))
+    count = len(gain.horizons)
+    found = iter([np.full((count + 1, 1), 1.0), np.r_[np.full((count, 1), 0.5), [[0.99]]],
+                  np.r_[np.full((count, 1), 2.0), [[0.5]]]])  # fmt: skip
+    monkeypatch.setattr(SimulationGain, "mean_squares", lambda *_: next(found))
+    best = fit_for_simulation(augmented.base_fitter, fit, train, gain)
+    assert best.share == simulation_fit.SHARES[1]
+    assert np.all(best.squares[:-1] == 0.5)
+
+
 def test_only_what_scales_the_noise_is_held(spring_fit):
     augmented, _, _ = spring_fit
     assert simulation_fit._scales(augmented.base_fitter) == ["q"]
@@ -276,3 +313,15 @@ def test_the_interval_covers_the_share_of_independent_origins():
     # 0.95, less what sixty origins and percentiles cost.
     assert covered / sets > 0.9
     assert table_rows("x", [Horizon(1)], [values[:3]], None) == []
+
+
+def test_origins_that_are_off_together_are_resampled_together():
+    """Blocks of ten equal pairs: their mean is known as by six, and not as by sixty."""
+    rng = np.random.default_rng(seed_of("blocks of origins"))
+    each = np.stack([rng.standard_normal(6), 0.6 * rng.standard_normal(6)], axis=1) ** 2
+    values = np.hstack([np.repeat(each, 10, axis=0), np.zeros((60, 1))])
+    widths = []
+    for rows in (6000, 60):  # the horizon of ten rows reaches over no origin, and over ten
+        (row,) = table_rows("x", [Horizon(10)], [values], rows)
+        widths.append(row["high"] - row["low"])
+    assert widths[1] > 1.7 * widths[0]
