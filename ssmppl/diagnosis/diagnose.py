@@ -19,6 +19,9 @@ from ssmppl.analysis.structure import simulators
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, proposal_of
+from ssmppl.diagnosis.fitting.bounds import bounds_note
+from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.cross_validation import FOLDS_CALLED, CrossValidation
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
 from ssmppl.diagnosis.heldout.predictions import Predictions, predict
@@ -37,7 +40,6 @@ from ssmppl.diagnosis.run.expected_time import seconds as expected
 from ssmppl.diagnosis.run.failures import Failures, reason_of
 from ssmppl.diagnosis.run.seeds import Stage, child_seed
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
 from ssmppl.diagnosis.selection.effect_selection import (
     MOST_WORK,
     EffectSelection,
@@ -45,7 +47,6 @@ from ssmppl.diagnosis.selection.effect_selection import (
     add_standard_errors,
 )
 from ssmppl.diagnosis.selection.equivalence import best_separating_input
-from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
 from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.inference.run.executors import check_executor

@@ -15,10 +15,11 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.fitting import fit
 from ssmppl.diagnosis.heldout import cross_validation, predictions
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.screening import screen
-from ssmppl.diagnosis.selection import effect_selection, fit, refit_test
+from ssmppl.diagnosis.selection import effect_selection, refit_test
 from ssmppl.errors import SSMError
 from ssmppl.language.distributions import Flat, HalfFlat
 from ssmppl.modelfile import load_model, read_csv

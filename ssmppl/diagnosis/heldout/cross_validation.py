@@ -22,6 +22,8 @@ import numpy as np
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, Fit, Fitter
 from ssmppl.diagnosis.heldout.gain_ratio import FEWEST_BLOCKS, NOT_GIVEN, HeldOutGain, gain_ratio
 from ssmppl.diagnosis.heldout.predictions import Predictions, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference
@@ -30,9 +32,7 @@ from ssmppl.diagnosis.heldout.simulation import compared, horizons, table_rows
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen, screen_part
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
-from ssmppl.diagnosis.selection.fit import APPROXIMATELY, Fit, Fitter
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.errors import ArgumentError, SSMError
 from ssmppl.inference.run.tasks import run_tasks

@@ -18,14 +18,14 @@ from scipy.special import stdtrit
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import WHOLE, segments
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.predictions import FreeRun, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference
 from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.heldout.simulation import FREE_RUN, compared, horizons, table_rows
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import Screen
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.selection.simulation_fit import fit_for_simulation

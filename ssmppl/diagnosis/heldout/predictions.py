@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.model.smoothing import Pass
 from ssmppl.diagnosis.run.seeds import Stream
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks

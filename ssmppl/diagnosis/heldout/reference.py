@@ -14,6 +14,8 @@ import numpy as np
 
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, WITHOUT_ERRORS, Fit, Fitter
 from ssmppl.diagnosis.heldout.predictions import predict
 from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.model.augment import augment, with_given_parameters
@@ -22,8 +24,6 @@ from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient
 from ssmppl.diagnosis.screening.familywise import familywise
 from ssmppl.diagnosis.screening.screen import Screen
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
-from ssmppl.diagnosis.selection.fit import APPROXIMATELY, WITHOUT_ERRORS, Fit, Fitter
 from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol

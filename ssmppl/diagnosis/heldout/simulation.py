@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.selection.horizons import HORIZONS, WINDOW, Ahead, Scores, look_ahead
 
 # What is simulated, as the horizons of the table `closed`: from the first row on; from the filtered

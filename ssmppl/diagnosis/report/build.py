@@ -9,6 +9,8 @@ import numpy as np
 
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
+from ssmppl.diagnosis.fitting.bounds import bounds_note
+from ssmppl.diagnosis.fitting.fit import Fit, Fitter, standard_errors
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.report import tables
 from ssmppl.diagnosis.report.engine_attributes import attribute_of
@@ -17,7 +19,6 @@ from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.screening.detection import PredictionChecks, detection
 from ssmppl.diagnosis.screening.screen import Screen
-from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note, standard_errors
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.verdict.decision import Decision, decide
 from ssmppl.diagnosis.verdict.results import Results

@@ -1,1 +1,1 @@
-"""Fits and refits, the choice among candidates, and what cannot be separated from it."""
+"""Refits, the choice among candidates, and what cannot be separated from it."""

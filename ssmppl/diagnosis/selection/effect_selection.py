@@ -8,7 +8,9 @@ of the two pairs it goes on, as long as an effect stands out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,12 +18,12 @@ from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.effect import NOISE_LAW, UNKNOWN_INPUT
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.fitting.fit import FROM_START, Fit
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
-from ssmppl.diagnosis.selection.fit import FROM_START, Fit
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import (
     EXPLAINED,
@@ -38,7 +40,7 @@ from ssmppl.diagnosis.selection.refit import (
 from ssmppl.diagnosis.selection.refit_test import CLOSER_LOOK_FACTOR, affordable, gain_p, refit_p
 from ssmppl.diagnosis.selection.shapes import shaped_all
 from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, gain_of_base
-from ssmppl.errors import SSMError
+from ssmppl.errors import ArgumentError, SSMError
 
 AFRESH = "refitting from default start"
 MOST_EFFECTS = 3
@@ -46,6 +48,7 @@ MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second 
 CARRIES_ON = 0.1  # of what a further cause gains one row ahead, that it has to gain beyond
 FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
 AGAIN_CALLED = 60  # likewise, of a model that calls a simulator
+FIRST_LOOK, NOTHING = 30, 0.5  # of these sets first; a family-wise p of so much by them is no gap
 
 
 @dataclass
@@ -352,10 +355,17 @@ class EffectSelection:
             failures=self.checkpoint.failures,
         )  # fmt: skip
         sets = AGAIN_CALLED if simulators(self.augmented.trace) else AGAIN
-        return run_screen(
-            design, self.train, chosen.fit.theta, min(self.screen.sets, sets), seed,
-            self.checkpoint, f"screening for effect {len(chosen.candidates) + 1}", checks=False,
+        again = partial(
+            run_screen, design, self.train, chosen.fit.theta, seed=seed,
+            checkpoint=self.checkpoint, checks=False,
+            stage=f"screening for effect {len(chosen.candidates) + 1}",
         )  # fmt: skip
+        if CLOSER_LOOK_FACTOR * self.alpha < NOTHING:
+            with suppress(ArgumentError):  # too few for so many parameters
+                first = again(sets=min(self.screen.sets, FIRST_LOOK))
+                if float(np.min(first.family.p, initial=1.0)) > NOTHING:
+                    return first
+        return again(sets=min(self.screen.sets, sets))
 
 
 def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | None:

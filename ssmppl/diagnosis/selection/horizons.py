@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.model.smoothing import CRPS_DRAWS_CALLED, samples_ahead
 from ssmppl.diagnosis.run.seeds import Stream
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.errors import SSMError
 from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.run.seeds import random_state

@@ -16,12 +16,8 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, refine_wave, starts_of
 from ssmppl.diagnosis.effects.effect import ASKED
-from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.run.seeds import Stream, Task, child_seed
-from ssmppl.diagnosis.screening.efficient_score import Efficient
-from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
-from ssmppl.diagnosis.selection.fit import (
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.fitting.fit import (
     APPROXIMATELY,
     FROM_START,
     WITHOUT_ERRORS,
@@ -30,6 +26,10 @@ from ssmppl.diagnosis.selection.fit import (
     Fitter,
     standard_errors,
 )
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.run.seeds import Stream, Task, child_seed
+from ssmppl.diagnosis.screening.efficient_score import Efficient
+from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, fit_for_simulation, restored
 from ssmppl.errors import NotApplicable, SSMError
@@ -185,15 +185,10 @@ def _backtracked(
     quadratic may promise a top beyond the data's cliff."""
     if fitter.exact:
         return start
-    problem, stream = fitter.problem, random_state(seed, Stream.START)
-    best, out = -np.inf, start
-    for share in SHARES:
-        tried = start | {n: share * start[n] for n in strengths}
-        theta = space_of(problem, fitter.fixed, tried).theta
-        value = fitter.estimate(train, theta, stream.copy())
-        if value > best:
-            best, out = value, tried
-    return out
+    tried = [start | {n: share * start[n] for n in strengths} for share in SHARES]
+    points = np.array([space_of(fitter.problem, fitter.fixed, s).theta for s in tried])
+    values = fitter.estimates(train, points, random_state(seed, Stream.START))
+    return tried[int(np.argmax(values))]
 
 
 def _information(

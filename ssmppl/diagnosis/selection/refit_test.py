@@ -20,12 +20,12 @@ import numpy as np
 
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, Fit
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.familywise import tail_p
 from ssmppl.diagnosis.screening.screen import Screen, compare_with_null
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
-from ssmppl.diagnosis.selection.fit import APPROXIMATELY, Fit
 from ssmppl.diagnosis.selection.refit import Refit, start_at
 from ssmppl.errors import SSMError
 from ssmppl.inference.run.seeds import random_state

@@ -16,11 +16,11 @@ import numpy as np
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import SHORTEST, Candidate
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, range_fraction
+from ssmppl.diagnosis.fitting.fit import Fit
 from ssmppl.diagnosis.model.scales import Scales, value_of
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import child_seed
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, range_fraction
-from ssmppl.diagnosis.selection.fit import Fit
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.refit import Refit, effort_for
 from ssmppl.diagnosis.selection.simulation_fit import fit_for_simulation

@@ -19,8 +19,8 @@ import numpy as np
 from ssmppl.analysis.structure import component_means
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.data import Experiment
+from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, NUMBERS, Fit, Fitter
 from ssmppl.diagnosis.run.checkpoint import Numbers
-from ssmppl.diagnosis.selection.fit import APPROXIMATELY, NUMBERS, Fit, Fitter
 from ssmppl.diagnosis.selection.horizons import SimulationGain, window_error
 from ssmppl.errors import SSMError
 from ssmppl.expressions.expr import symbols_of

@@ -8,13 +8,13 @@ from typing import Any
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain
 from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.effect_selection import SelectionResult
 from ssmppl.diagnosis.selection.equivalence import Classes, equivalence_classes, group_leaders
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.verdict.verdicts import CURVES
 from ssmppl.language.model.trace import Trace

@@ -9,6 +9,7 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.fitting.fit import Fitter
 from ssmppl.diagnosis.heldout.predictions import (
     FreeRun,
     Predictions,
@@ -19,7 +20,6 @@ from ssmppl.diagnosis.heldout.predictions import (
 )
 from ssmppl.diagnosis.heldout.row_split import three_parts, without
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import SamplingError
 from ssmppl.inference.run.problem import pose
 from tests.diagnosis.small import level, levels

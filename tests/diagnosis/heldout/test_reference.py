@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.fitting.fit import FROM_START, Fitter
 from ssmppl.diagnosis.heldout import reference
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
-from ssmppl.diagnosis.selection.fit import FROM_START, Fitter
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.diagnosis.model.test_basis import THETA, asked, simulated
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import norm
 
 import ssmppl as ssm
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.heldout.predictions import predict
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.initial_law import (
@@ -21,7 +22,6 @@ from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report.build import _written
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.refit import refit_all
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.run.problem import pose

@@ -10,6 +10,8 @@ import ssmppl as ssm
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.data import bind, check_parameters
+from ssmppl.diagnosis.fitting.augmented_models import proposal_of
+from ssmppl.diagnosis.fitting.fit import Fitter
 from ssmppl.diagnosis.heldout.predictions import stretches
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.diagnosis.model.smoothing import (
@@ -19,8 +21,6 @@ from ssmppl.diagnosis.model.smoothing import (
     Smoother,
     probability_transforms,
 )
-from ssmppl.diagnosis.selection.augmented_models import proposal_of
-from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.run.problem import pose

@@ -6,11 +6,11 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.data import bind, check_parameters
+from ssmppl.diagnosis.fitting.fit import Effort, Fitter
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings, Simulator
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.fit import Effort, Fitter
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence

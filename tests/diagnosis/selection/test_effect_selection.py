@@ -11,6 +11,7 @@ from ssmppl.diagnosis.effects import catalogue_sensor as ssm_effects
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.catalogue import effects
 from ssmppl.diagnosis.effects.effect import CAUSES
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.model.scales import Scales, VariableScale
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
@@ -18,7 +19,6 @@ from ssmppl.diagnosis.screening.familywise import familywise, tail_p
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection import effect_selection as module
 from ssmppl.diagnosis.selection import refit as refits_of
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
 from ssmppl.diagnosis.selection.equivalence import _of_the_best
 from ssmppl.diagnosis.selection.horizons import SimulationGain

@@ -8,11 +8,11 @@ import pytest
 import ssmppl as ssm
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.catalogue import effects
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.heldout.simulation import Horizon, compared, horizons, table_rows
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.selection import horizons as module
 from ssmppl.diagnosis.selection import simulation_fit
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.horizons import SimulationGain, look_ahead
 from ssmppl.diagnosis.selection.simulation_fit import fit_for_simulation, gain_of_base, restored
 from ssmppl.inference.run.problem import missing_of, pose

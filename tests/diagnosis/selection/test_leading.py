@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.heldout.gain_ratio import Gain, HeldOutGain
 from ssmppl.diagnosis.heldout.row_split import GAP, head, three_parts
 from ssmppl.diagnosis.model.scales import Scales
@@ -17,7 +18,6 @@ from ssmppl.diagnosis.report.text import cause_rows
 from ssmppl.diagnosis.report.words import headline, how_far, how_sure, leaders, which
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.effect_selection import SelectionResult
 from ssmppl.diagnosis.selection.refit import refit, refit_all
 from ssmppl.diagnosis.verdict import decision

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, range_fraction
+from ssmppl.diagnosis.fitting.fit import FROM_START
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.selection import shapes
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, range_fraction
-from ssmppl.diagnosis.selection.fit import FROM_START
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.selection.shapes import PRICE, shape_bounds, shaped_all
 from ssmppl.inference.run.problem import missing_of, pose

@@ -11,11 +11,11 @@ from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.compiling import LOCK
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.fitting.fit import Fitter
 from ssmppl.diagnosis.model.augment import augment, with_given_parameters
 from ssmppl.diagnosis.model.basis import symbolic_shapes
 from ssmppl.diagnosis.model.initial_law import ProperInitialLaw, needs_proper_initial_law
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.run.problem import Problem

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.fitting.bounds import COST, bounds_note, flat_outwards, hold_at_bounds
+from ssmppl.diagnosis.fitting.fit import FROM_START, Fitter, standard_errors
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.fit import (
-    COST,
-    FROM_START,
-    Fitter,
-    bounds_note,
-    flat_outwards,
-    hold_at_bounds,
-    standard_errors,
-)
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.diagnosis.small import level

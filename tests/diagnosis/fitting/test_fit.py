@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
+from ssmppl.diagnosis.fitting.fit import FROM_START, Effort, Fitter
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.fit import FROM_START, Effort, Fitter
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.maximum.ascent import Maximization

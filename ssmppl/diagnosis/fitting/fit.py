@@ -5,12 +5,6 @@ smooth and takes a millisecond. For linear Gaussian models it is exact; where th
 end at its top, and from starts that nothing is known of, they are climbed with their exact score.
 Others are climbed from several starts, and from there by the particle smoother's score. How far the
 top still is is measured in nats: g' H^-1 g / 2 is what a quadratic would still gain.
-
-Scales and shares may be driven to a bound of their support: a process noise of nothing. There the
-likelihood is flat on the unconstrained scale: where the climb ended says nothing (1e-4 or 1e-13, as
-it happened), and a curvature there is no information. Such a number is held at the value nearest to
-where it is of consequence, the farthest inside that costs next to nothing, which keeps the other
-numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their distribution).
 """
 
 from __future__ import annotations
@@ -19,20 +13,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import takewhile
 from typing import Any
 
 import numpy as np
 
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.diagnosis.fitting.bounds import flat_outwards, hold_at_bounds
+from ssmppl.diagnosis.fitting.densities import best_of_many, densities_of, density_of
+from ssmppl.diagnosis.fitting.noisy_ascent import NEAR, stochastic_quasi_newton
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
 from ssmppl.diagnosis.run.expected_time import timed
 from ssmppl.diagnosis.run.seeds import Stream
-from ssmppl.diagnosis.selection.densities import best_of_many, densities_of, density_of
-from ssmppl.diagnosis.selection.noisy_ascent import NEAR, stochastic_quasi_newton
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.batched.call import thriftily
@@ -73,15 +67,6 @@ TOGETHER = 16  # points that are timed, where many are looked at in one call
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
 LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
 LARGEST = 1e100  # of a score: what is beyond is an overflow
-
-# Numbers that run to a bound of their support.
-OUTWARDS = (1.0, 3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 3 to 160,000
-FREE = 0.1  # nats that going outwards may cost where the bound is the place of the maximum
-COST = 0.05  # nats that the value which is held may cost
-# Inwards, where the value that is held is looked for: as far as the smallest number there is.
-GRID = [*np.linspace(0.5, 40.0, 80).tolist(), *np.linspace(45.0, 800.0, 152).tolist()]
-STEPS = 40  # of halving
-FALL = 0.5  # nats by which the function has to fall inside: else the number is not identified
 
 NUMBERS = (  # of a fit, in a checkpoint
     "theta", "z", "log_likelihood", "error", "information", "distance", "converged", "at_bound",
@@ -601,6 +586,18 @@ class Fitter:
         problem = replace(self.problem, experiments=tuple(experiments))
         return self._estimate(problem, theta, self.settings.particles, stream)
 
+    def estimates(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
+    ) -> np.ndarray:
+        """(B,) likewise, of each row of theta (B, P), with the same random numbers; by the extended
+        Kalman filter where that looks at many points at once."""
+        problem = replace(self.problem, experiments=tuple(experiments))
+        many = self._extended_of_many(problem)
+        if many is not None:
+            return summed(many(theta))
+        particles = self.settings.particles
+        return np.array([self._estimate(problem, t, particles, stream.copy()) for t in theta])
+
     def _estimate(
         self, problem: Problem, theta: np.ndarray, particles: int, stream: np.ndarray
     ) -> float:
@@ -714,50 +711,6 @@ class Fitter:
         return self._unconstrained(space, theta, square, seed)
 
 
-def hold_at_bounds(
-    function: Callable[[np.ndarray], float], z: np.ndarray, candidates: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(z, mask), each (F,): where a bound is the place of the maximum, and z moved inside there.
-
-    function : what was maximised. candidates : (F,) bool, those that have a bound to run to.
-    """
-    z, mask = np.array(z, dtype=float), np.zeros(len(z), dtype=bool)
-    for i in np.flatnonzero(candidates):
-        here = function(z)
-
-        def at(step: float, i: int = int(i)) -> float:
-            there = z.copy()
-            there[i] += step
-            return function(there)
-
-        for sign in (-1.0, 1.0):
-            # As far as there are values: nothing is resolved any more where a noise is tiny.
-            out = list(takewhile(lambda v: v > -np.inf, (at(sign * s) for s in OUTWARDS)))
-            if not out or min(out) < here - FREE:
-                continue
-            top = max(here, *out)
-            inside = next((s for s in GRID if not at(-sign * s) > top - FALL), None)
-            if inside is None:  # flat either way: this number is not identified
-                continue
-            good, bad = -OUTWARDS[int(np.argmax(out))], inside  # inwards, from what costs nothing
-            for _ in range(STEPS):
-                middle = 0.5 * (good + bad)
-                good, bad = (middle, bad) if at(-sign * middle) >= top - COST else (good, middle)
-            z[i] -= sign * good
-            mask[i] = True
-            break
-    return z, mask
-
-
-def flat_outwards(function: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -> np.ndarray:
-    """(F,) bool: which may have run to a bound, as the first step outwards costs nothing; by the
-    function (B, F) -> (B,) of many points at once."""
-    steps = OUTWARDS[0] * np.eye(len(z))
-    here, *away = summed(function(np.vstack([z[None], z + steps, z - steps])))
-    found: np.ndarray = np.any(np.reshape(away, (2, -1)) >= here - FREE, axis=0)
-    return found
-
-
 def component_names(space: Space, mask: np.ndarray) -> list[str]:
     """The components of the free numbers in `mask` (F,), by their text: `q`, `s[0]`."""
     every: list[str] = []
@@ -766,20 +719,6 @@ def component_names(space: Space, mask: np.ndarray) -> list[str]:
         every += (repr(t.components[k]) if single else t.site.name for k in range(len(t.free)))
     free = [every[i] for i in space.positions]
     return list(dict.fromkeys(n for n, m in zip(free, mask, strict=True) if m))
-
-
-def bounds_note(names: Sequence[str], values: dict[str, float], what: str) -> str:
-    """A note on parameters at a bound."""
-    if not names:
-        return ""
-    values_at = ", ".join(f"{n} = {values[n]:.3g}" if n in values else n for n in names)
-    one = len(names) == 1
-    return (
-        f"in {what} the {'estimate' if one else 'estimates'} of {' and '.join(names)} "
-        f"{'is on the boundary of its' if one else 'are on the boundary of their'} support; "
-        f"{'it is' if one else 'they are'} fixed just inside ({values_at}, at a cost of {COST:g} "
-        f"nats{'' if one else ' each'}), and standard errors of the others are conditional on that"
-    )
 
 
 def positive_definite(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:

@@ -3,9 +3,9 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.inference.run.problem import missing_of, pose
 from tests.diagnosis.harness import scales
 from tests.models import gaps as models

@@ -1,0 +1,83 @@
+"""Parameters whose estimate runs to a bound of their support.
+
+Scales and shares may be driven to a bound of their support: a process noise of nothing. There the
+likelihood is flat on the unconstrained scale: where the climb ended says nothing (1e-4 or 1e-13, as
+it happened), and a curvature there is no information. Such a number is held at the value nearest to
+where it is of consequence, the farthest inside that costs next to nothing, which keeps the other
+numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their distribution).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import takewhile
+
+import numpy as np
+
+from ssmppl.inference.optimisation.batched_newton import summed
+
+OUTWARDS = (1.0, 3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 3 to 160,000
+FREE = 0.1  # nats that going outwards may cost where the bound is the place of the maximum
+COST = 0.05  # nats that the value which is held may cost
+# Inwards, where the value that is held is looked for: as far as the smallest number there is.
+GRID = [*np.linspace(0.5, 40.0, 80).tolist(), *np.linspace(45.0, 800.0, 152).tolist()]
+STEPS = 40  # of halving
+FALL = 0.5  # nats by which the function has to fall inside: else the number is not identified
+
+
+def hold_at_bounds(
+    function: Callable[[np.ndarray], float], z: np.ndarray, candidates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(z, mask), each (F,): where a bound is the place of the maximum, and z moved inside there.
+
+    function : what was maximised. candidates : (F,) bool, those that have a bound to run to.
+    """
+    z, mask = np.array(z, dtype=float), np.zeros(len(z), dtype=bool)
+    for i in np.flatnonzero(candidates):
+        here = function(z)
+
+        def at(step: float, i: int = int(i)) -> float:
+            there = z.copy()
+            there[i] += step
+            return function(there)
+
+        for sign in (-1.0, 1.0):
+            # As far as there are values: nothing is resolved any more where a noise is tiny.
+            out = list(takewhile(lambda v: v > -np.inf, (at(sign * s) for s in OUTWARDS)))
+            if not out or min(out) < here - FREE:
+                continue
+            top = max(here, *out)
+            inside = next((s for s in GRID if not at(-sign * s) > top - FALL), None)
+            if inside is None:  # flat either way: this number is not identified
+                continue
+            good, bad = -OUTWARDS[int(np.argmax(out))], inside  # inwards, from what costs nothing
+            for _ in range(STEPS):
+                middle = 0.5 * (good + bad)
+                good, bad = (middle, bad) if at(-sign * middle) >= top - COST else (good, middle)
+            z[i] -= sign * good
+            mask[i] = True
+            break
+    return z, mask
+
+
+def flat_outwards(function: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -> np.ndarray:
+    """(F,) bool: which may have run to a bound, as the first step outwards costs nothing; by the
+    function (B, F) -> (B,) of many points at once."""
+    steps = OUTWARDS[0] * np.eye(len(z))
+    here, *away = summed(function(np.vstack([z[None], z + steps, z - steps])))
+    found: np.ndarray = np.any(np.reshape(away, (2, -1)) >= here - FREE, axis=0)
+    return found
+
+
+def bounds_note(names: Sequence[str], values: dict[str, float], what: str) -> str:
+    """A note on parameters at a bound."""
+    if not names:
+        return ""
+    values_at = ", ".join(f"{n} = {values[n]:.3g}" if n in values else n for n in names)
+    one = len(names) == 1
+    return (
+        f"in {what} the {'estimate' if one else 'estimates'} of {' and '.join(names)} "
+        f"{'is on the boundary of its' if one else 'are on the boundary of their'} support; "
+        f"{'it is' if one else 'they are'} fixed just inside ({values_at}, at a cost of {COST:g} "
+        f"nats{'' if one else ' each'}), and standard errors of the others are conditional on that"
+    )
