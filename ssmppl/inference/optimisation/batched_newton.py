@@ -1,20 +1,21 @@
-"""Newton's ascent of a function that takes many points at once, where many cost little more than
-one.
+"""Newton's ascent of a function that takes many points at once.
 
-Value and gradient are differences over one set of points, and the shares of a step are tried
-together with the differences at its whole, so that a step that climbs costs one call. Second
-derivatives take many points. Of a log-likelihood whose increments are known row by row the climb
-begins with the outer products of their slopes (Berndt, Hall, Hall and Hausman, *Annals of Economic
-and Social Measurement* 3, 1974), which cost nothing more; of another function with differences.
-Differences are taken where a step led nowhere, and at the top; between these the slopes update what
-there is (`newton.bfgs_update`), and before a climb ends by that it is held against outer products
-made there. Several climbs go on side by side in the same calls. Where the
-function is not concave, eigenvalues count by their size (`newton.newton_step`).
+Value and gradient are differences over one set of points, so that a step that climbs costs one
+call; shares of it are tried where it does not, or climbs by much less than it promised. On the way
+up slopes take one point in each coordinate, and what a difference to one side adds is taken off by
+the second derivatives that there are, which is not enough near the top of a long ridge: there they
+take two. Second derivatives take many points. Of a log-likelihood whose increments
+are known row by row the climb begins with the outer products of their slopes (Berndt, Hall, Hall
+and Hausman, *Annals of Economic and Social Measurement* 3, 1974), which cost nothing more; of
+another function with differences. Differences are taken where a step led nowhere, and at the top;
+between these the slopes update what there is (`newton.bfgs_update`), and before a climb ends by
+that it is held against outer products made there. Several climbs go on side by side in the same
+calls. Where the function is not concave, eigenvalues count by their size (`newton.newton_step`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,19 +33,22 @@ LATE = 3  # steps of the others once the highest is at its end
 EARLY, HOPEFUL = 3, 3.0  # steps after which those wait that cannot reach the highest one, even if
 # they had so many times as far to go as their quadratics say
 SHARES = (1.0, 0.5, 0.15, 0.03, 1e-3)  # of a step that are tried
+ENOUGH = 0.1  # of what a step promises: where it gains less, shares of it are tried
 MUCH = 0.4  # of a step: where less of it is best, its second derivatives were wrong
+CLOSE = 0.5  # nats that the quadratic still expects, from where on slopes take both sides
 GOOD = 1e-7  # that the quadratic still expects to gain, where a climb is at its end
 FINAL = 1e-3  # from where on differences are extrapolated to zero step
 NEAR = 1e-2  # likewise, where a climb that need not be precise is at its end
 LEAST_SCALE = 1e-3  # of outer products
-SLOPES, CURVATURES, FINE = 1, 2, 3  # what a stencil tells
+FORWARD, SLOPES, CURVATURES, FINE = 0, 1, 2, 3  # what a stencil tells
 
 
 @dataclass(eq=False)
 class Climber:
     """One of the climbs. size : (F,) of its differences. path : where it has been. stale : whether
     second derivatives are to be taken anew; by_parts : whether outer products will do for that;
-    rough : whether those are all there is."""
+    rough : whether those are all there is. told : what the last stencil was to tell. bent : (F,)
+    minus the second derivatives of the last part of a sum, where they were looked at."""
 
     z: np.ndarray
     value: float
@@ -58,13 +62,17 @@ class Climber:
     stale: bool = True
     by_parts: bool = False
     rough: bool = False
+    told: int = FORWARD
+    bent: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
     def tells(self) -> int:
         """What its next stencil has to tell."""
         if self.distance < FINAL:
             return FINE
-        return CURVATURES if self.stale and not self.by_parts else SLOPES
+        if self.stale:
+            return SLOPES if self.by_parts else CURVATURES
+        return SLOPES if self.distance < CLOSE else FORWARD
 
     @property
     def top(self) -> Top:
@@ -104,26 +112,28 @@ def climb_together(function: Function, starts: np.ndarray, precise: bool = True)
             break
         _step(function, going)
         for c in climbers if not precise else ():
-            c.ended = c.ended or c.distance < NEAR
+            c.ended = c.ended or (c.distance < NEAR and c.told > FORWARD)
     return max(climbers, key=lambda c: c.value)
 
 
 def _step(function: Function, climbers: list[Climber]) -> None:
     """One step of each."""
-    moves, points, counts = [], [], []
+    moves = {}
     for c in climbers:
         move = newton_step(c.slope, c.information)
         size = float(np.max(np.abs(move) / np.maximum(1.0, np.abs(c.z))))
-        moves.append(move * min(1.0, c.reach / max(size, 1e-300)))
-        own = [c.z + share * moves[-1] for share in SHARES[1:]]
-        own += _stencil(c.z + moves[-1], c.size, c.tells)
-        points += own
-        counts.append(len(own))
-    found = np.split(function(np.array(points)), np.cumsum(counts)[:-1])
+        moves[c] = move * min(1.0, c.reach / max(size, 1e-300))
+    found = _together(function, [_stencil(c.z + moves[c], c.size, c.tells) for c in climbers])
+    wholes = dict(zip(climbers, found, strict=True))
+    gained = {c: float(summed(wholes[c][:1])[0]) - c.value for c in climbers}
+    short = [c for c in climbers if not gained[c] > ENOUGH * _promised(c, moves[c])]
+    parts = _together(function, [[c.z + s * moves[c] for s in SHARES[1:]] for c in short])
+    shares = dict(zip(short, parts, strict=True))
     later: dict[Climber, np.ndarray | None] = {}
-    for c, move, values in zip(climbers, moves, found, strict=True):
-        stencil = values[len(SHARES) - 1 :]
-        tried = summed(np.concatenate([stencil[:1], values[: len(SHARES) - 1]]))
+    for c in climbers:
+        move, tried = moves[c], np.array([c.value + gained[c]])
+        if c in shares:
+            tried = np.concatenate([tried, summed(shares[c])])
         k = int(np.argmax(np.where(np.isfinite(tried), tried, -np.inf)))
         if not tried[k] > c.value:
             # a gain below the rounding of the function: the step is as right as can be told
@@ -137,27 +147,41 @@ def _step(function: Function, climbers: list[Climber]) -> None:
         c.path.append(c.z.copy())
         c.reach = FARTHEST if k == 0 else max(c.reach * 0.5, 10.0 * SHORTEST)
         if k == 0:
-            _take(c, stencil, c.tells, move)
+            _take(c, wholes[c], c.tells, move)
         else:
-            c.stale, c.by_parts = c.stale or SHARES[k] < MUCH, values.ndim > 1
+            c.stale, c.by_parts = c.stale or SHARES[k] < MUCH, wholes[c].ndim > 1
             later[c] = None if c.stale else SHARES[k] * move
     if later:
         _differentiate(function, later)
 
 
+def _promised(c: Climber, move: np.ndarray) -> float:
+    """What the quadratic expects a step to gain; a shortened one at most that."""
+    return max(float(c.slope @ move - 0.5 * move @ c.information @ move), 0.0)
+
+
+def _together(function: Function, sets: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+    """The values of each set of points, by one call."""
+    if not sets:
+        return []
+    found = function(np.array([z for own in sets for z in own]))
+    return np.split(found, np.cumsum([len(own) for own in sets])[:-1])
+
+
 def _differentiate(function: Function, climbers: Mapping[Climber, np.ndarray | None]) -> None:
     """The derivatives of each where it stands, with the step that led there, where second
     derivatives are to be updated by it."""
-    sets = [_stencil(c.z, c.size, c.tells) for c in climbers]
-    found = function(np.array([z for own in sets for z in own]))
-    parts = np.split(found, np.cumsum([len(s) for s in sets])[:-1])
+    parts = _together(function, [_stencil(c.z, c.size, c.tells) for c in climbers])
     for (c, move), values in zip(climbers.items(), parts, strict=True):
         _take(c, values, c.tells, move)
 
 
 def _stencil(z: np.ndarray, size: np.ndarray, tells: int) -> list[np.ndarray]:
-    """z, then for each step its two sides of each coordinate, and of each pair together."""
+    """z, then for each step its two sides of each coordinate, and of each pair together; of
+    `FORWARD` the one side alone."""
     points, n = [z], len(z)
+    if tells == FORWARD:
+        return points + [_moved(z, {i: size[i]}) for i in range(n)]
     for times in (1.0, 2.0) if tells == FINE else (1.0,):
         for sign in (times, -times):
             for i in range(n):
@@ -178,26 +202,33 @@ def _moved(z: np.ndarray, by: dict[int, float]) -> np.ndarray:
 def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = None) -> None:
     """Slope, curvature and the next steps from the values at a stencil, that `move` led to."""
     values, parts, size = summed(values), values if values.ndim > 1 else None, c.size
-    if tells == SLOPES:
-        up, down = np.split(values[1:], 2)
-        slope = _slopes(values[0], up, down, c.size)
+    if tells <= SLOPES:
+        if tells == FORWARD:
+            known = 0.0 if c.rough else np.diagonal(c.information)
+            slope = (values[1:] - values[0]) / size + 0.5 * known * size
+        else:
+            up, down = np.split(values[1:], 2)
+            slope = _slopes(values[0], up, down, size)
+        if tells == SLOPES and parts is not None:
+            c.bent = _bent(parts, size)
         curvature = -c.information
         if move is not None:
             curvature = -_updated(c.information, move, c.slope - slope, c.rough)
             c.rough = False
         elif parts is not None:
-            curvature, c.rough = -_outer_products(parts, c.size), True
+            curvature, c.rough = -_outer_products(parts, size, c.bent), True
         c.stale = not np.all(np.isfinite(slope))
+        c.by_parts = c.stale and tells == FORWARD and parts is not None
     else:
         slope, curvature = derivatives(values, c.size)
         c.stale = False
-    missing = ~np.isfinite(slope)
+    c.told, missing = tells, ~np.isfinite(slope)
     c.slope = np.where(missing, 0.0, slope)
     c.information = np.where(np.isfinite(curvature), -curvature, 0.0)
     c.distance = _distance(c)
     if tells == SLOPES and parts is not None and c.distance < NEAR:
         # What was too large once in a direction of no step would be taken for the top.
-        c.information, c.rough = _outer_products(parts, size), True
+        c.information, c.rough = _outer_products(parts, size, c.bent), True
         c.distance = _distance(c)
     c.ended = c.distance < GOOD and tells == FINE and not missing.any()
     wanted = np.where(missing, 0.1 * c.size, _sizes(c.information))
@@ -258,19 +289,29 @@ def summed(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(total), total, -np.inf)
 
 
-def _outer_products(parts: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """(F, F) the sum over parts of the products of their slopes, from those (1 + 2 F, R) at a point
-    and at both sides of it; of the last part its second differences instead, one by one."""
+def _outer_products(parts: np.ndarray, h: np.ndarray, bent: np.ndarray) -> np.ndarray:
+    """(F, F) the sum over parts of the products of their slopes, from those (1 + F, R) at a point
+    and beside it, or (1 + 2 F, R) at both sides; of the last part `bent` (F,) instead."""
     n = len(h)
     middle, up, down = parts[0], parts[1 : n + 1], parts[n + 1 :]
     with np.errstate(invalid="ignore"):
-        slopes = (up - down) / (2.0 * h)[:, None]
-        one_sided = np.where(np.isfinite(up), up - middle, middle - down) / h[:, None]
-        slopes = np.where(np.isfinite(slopes), slopes, one_sided)[:, :-1]
-        bent = (2.0 * middle - up - down)[:, -1] / h**2
-    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        slopes = (up - middle) / h[:, None]
+        if len(down):
+            one_sided = np.where(np.isfinite(slopes), slopes, (middle - down) / h[:, None])
+            slopes = (up - down) / (2.0 * h)[:, None]
+            slopes = np.where(np.isfinite(slopes), slopes, one_sided)
+    slopes = np.where(np.isfinite(slopes), slopes, 0.0)[:, :-1]
     found: np.ndarray = slopes @ slopes.T
-    return found + np.diag(np.where(bent > 0.0, bent, 0.0))
+    return found + np.diag(bent)
+
+
+def _bent(parts: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """(F,) minus the second differences of the last part, from the parts (1 + 2 F, R) at a point
+    and at both sides of it; 0 where they are not positive."""
+    n, last = len(h), parts[:, -1]
+    with np.errstate(invalid="ignore"):
+        found = (2.0 * last[0] - last[1 : n + 1] - last[n + 1 :]) / h**2
+    return np.where(found > 0.0, found, 0.0)
 
 
 def _updated(
