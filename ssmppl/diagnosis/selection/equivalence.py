@@ -1,7 +1,9 @@
 """Equivalence classes of candidates that these data do not separate, and the input that would.
 
 The class of the best is its confidence set: the refits that lie no further behind than the truth
-would by chance, and candidates whose scores correlate so much with the best one's that its gain
+would by chance; those of its kind that lose no more to it than a formula that is only about right
+would lose to the machine's own law, whose effect may have the better formula next time; and
+candidates whose scores correlate so much with the best one's that its gain
 does not separate them.
 
 Near the base model the log-likelihood gains are quadratic: under truth k of strength lambda the
@@ -29,6 +31,7 @@ from ssmppl.inference.run.seeds import random_state
 
 SEPARATING = 2.7  # 1.645^2: times 1 / (1 - |rho|), the gain that separates two effects at 5%
 LEAST_CUT = 2.0  # nats behind the best that any member of a confidence set may be
+FORM = 0.1  # likewise, as a share of what the best gains: no formula is the machine's own
 DRAWS = 4000  # of the scores, for the cuts
 
 # Inputs under which a class might separate.
@@ -173,12 +176,13 @@ def equivalence_classes(screen: Screen, refits: Sequence[Refit], order: Sequence
     at = np.array(order, dtype=int)
     rho, sided = screen.efficient.rho[np.ix_(at, at)], screen.efficient.sided[at]
     gains = np.array([refitted.get(int(k), screen.efficient.gain[k]) for k in at])
+    kind = np.array([screen.design.candidates[k].effect.cause for k in at])
     strong = np.array(
         [int(k) in refitted or screen.efficient.gain[k] >= SEPARATING for k in at], bool
     )
     class_id, leader = np.zeros(len(at), int), np.arange(len(at))
     if refitted:
-        first = _of_the_best(rho, gains, sided, len(refitted), strong)
+        first = _of_the_best(rho, gains, sided, len(refitted), strong, kind)
         class_id[first], leader[first] = 1, 0
     rest = np.flatnonzero(strong & (class_id == 0))
     if len(rest):
@@ -191,12 +195,14 @@ def equivalence_classes(screen: Screen, refits: Sequence[Refit], order: Sequence
 
 
 def _of_the_best(
-    rho: np.ndarray, gains: np.ndarray, sided: np.ndarray, refitted: int, strong: np.ndarray
-) -> np.ndarray:
+    rho: np.ndarray, gains: np.ndarray, sided: np.ndarray, refitted: int, strong: np.ndarray,
+    kind: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """(K,) bool: the confidence set among the refitted, who come first, and who is like the best
     among those that were not."""
     own = np.flatnonzero(gains[:refitted] <= gains[0])
     cut = cuts(rho[np.ix_(own, own)], gains[own], range(len(own)), sided=sided[own])
+    cut = np.maximum(cut, np.where(kind[own] == kind[0], FORM * gains[0], 0.0))
     out = np.zeros(len(gains), bool)
     out[own] = confidence_set(gains[own], cut)
     alike = ~distinguishable(gains[0], similarity(rho, sided)[0]) & strong

@@ -317,10 +317,14 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
 @pytest.mark.parametrize(("top", "share"), [(1.1, 1.0), (0.6, 0.5), (0.1, 0.25)])
 def test_a_fit_starts_where_the_data_are_likelier(monkeypatch, top, share):
     """The quadratic promises a strength of 1; the likelihood is highest at `top`."""
-    monkeypatch.setattr(refits_of, "space_of", lambda _, fixed, start: SimpleNamespace(theta=start))
+
+    def space(_, fixed, start):
+        return SimpleNamespace(theta=np.array([start["old"], start["new"]]))
+
+    monkeypatch.setattr(refits_of, "space_of", space)
     fitter = SimpleNamespace(
         exact=False, problem=None, fixed={},
-        estimate=lambda _, theta, stream: -((theta["new"] - top) ** 2) + theta["old"],
+        estimates=lambda _, theta, stream: theta[:, 0] - (theta[:, 1] - top) ** 2,
     )  # fmt: skip
     start = {"old": 3.0, "new": 1.0}
     found = refits_of._backtracked(fitter, start, ["new"], (), seed_sequence(1))
@@ -518,5 +522,15 @@ def test_shapes_of_one_effect_are_ranked_by_all_horizons():
 
 def test_what_was_passed_over_is_no_rival():
     gains, rho = np.array([10.0, 14.0, 9.5]), np.eye(3)
-    found = _of_the_best(rho, gains, np.zeros(3, int), 3, np.ones(3, bool))
+    kinds = np.array(["mechanism"] * 3)
+    found = _of_the_best(rho, gains, np.zeros(3, int), 3, np.ones(3, bool), kinds)
     assert found.tolist() == [True, False, True]
+
+
+def test_formulas_of_a_kind_that_do_nearly_as_well_are_in_one_class():
+    """A tenth of what the best gains, which chance alone does not make up for; not those of another
+    kind, nor what was not refitted."""
+    gains, rho = np.array([100.0, 91.0, 89.0, 95.0, 92.0]), np.eye(5)
+    kinds = np.array(["mechanism", "mechanism", "mechanism", "unknown input", "mechanism"])
+    found = _of_the_best(rho, gains, np.zeros(5, int), 4, np.ones(5, bool), kinds)
+    assert found.tolist() == [True, True, False, False, False]
