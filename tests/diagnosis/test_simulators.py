@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.fitting.fit import Fitter
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.diagnosis.model.smoothing import Settings, Smoother
+from ssmppl.inference.batched.extended import extended_model
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.tracing import trace
@@ -66,6 +68,31 @@ def trend(function):
 
     made.observation(lambda x: {"y": ssm.Normal(x, sd=0.4)})
     return made
+
+
+def test_starts_are_compared_by_the_filter_of_many_points():
+    """By one call of it; of a model without a simulator by the particle filter with one set of
+    random numbers."""
+    points = np.array([[0.8, 0.2], [0.9, 0.3], [0.5, 0.2]])
+    y = np.random.default_rng(4).normal(size=40)
+
+    @ssm.simulator(state=["x", "v"], parameters=["a"])
+    def moved(state, inputs, parameters):
+        x, v = state.T
+        return np.stack([x + v, parameters[:, 0] * v], axis=1)
+
+    problem = pose(trend(lambda x, v, a: moved([x, v], [], [a]).values()), {"y": y})
+    fitter = Fitter(problem, {}, Settings(100, "twisted"))
+    stream = random_state(seed_sequence(3))
+    values = fitter.estimates(problem.experiments, points, stream.copy())
+    extended = extended_model(problem.trace)
+    exact = [extended.log_likelihood(problem.experiments, p) for p in points]
+    np.testing.assert_allclose(values, exact, rtol=1e-6)
+    problem = pose(trend(lambda x, v, a: (x + v, np.sin(a * v))), {"y": y})
+    fitter = Fitter(problem, {}, Settings(50, "bootstrap"))
+    values = fitter.estimates(problem.experiments, points, stream.copy())
+    again = [fitter.estimate(problem.experiments, p, stream.copy()) for p in points]
+    np.testing.assert_array_equal(values, again)
 
 
 def passed(model, y):

@@ -32,6 +32,7 @@ from ssmppl.diagnosis.selection.refit import (
     preferred,
 )
 from ssmppl.diagnosis.selection.refit_test import gain_p
+from ssmppl.errors import ArgumentError
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.diagnosis.small import level, levels
@@ -509,6 +510,37 @@ def test_what_a_better_place_for_the_model_simulates_is_no_gain_of_an_effect(mon
     assert out.rebased
     assert out.refits[0].gain == 20.0
     assert out.refits[0].ahead == pytest.approx(40.0 - 60 / 6 * np.log(2))
+
+
+@pytest.mark.parametrize(
+    ("alpha", "least", "too_few", "asked"),
+    [
+        (0.05, 0.6, False, [30]),  # by the first sets there is nothing
+        (0.05, 0.4, False, [30, 60]),  # they do not tell
+        (0.05, 0.6, True, [30, 60]),  # they are too few for so many parameters
+        (0.2, 0.6, False, [60]),  # so rare a p would be looked at more closely anyhow
+    ],
+)
+def test_a_further_screen_ends_where_nothing_stands_out(monkeypatch, alpha, least, too_few, asked):
+    sets_of = []
+
+    def screened(*_, sets, **__):
+        sets_of.append(sets)
+        if too_few and sets == 30:
+            raise ArgumentError("too few sets", fix="more")
+        return SimpleNamespace(family=SimpleNamespace(p=np.array([least, 0.9])), sets=sets)
+
+    monkeypatch.setattr(module, "run_screen", screened)
+    monkeypatch.setattr(module, "ScreenDesign", lambda *_, **__: None)
+    monkeypatch.setattr(module, "simulators", lambda _: [1])
+    problem = SimpleNamespace(trace=None)
+    fitter = SimpleNamespace(problem=problem, fixed={}, settings=None, initial_law=None)
+    chosen = SimpleNamespace(fitter=fitter, fit=SimpleNamespace(bounds=[], theta=None),
+                             candidates=(1,))  # fmt: skip
+    screen = SimpleNamespace(design=SimpleNamespace(scales=None), sets=100)
+    choice = replace(choice_of(screen, trace=None, missing=None), alpha=alpha)
+    assert choice._screen_again(chosen, [], None).sets == asked[-1]
+    assert sets_of == asked
 
 
 def test_shapes_of_one_effect_are_ranked_by_all_horizons():
