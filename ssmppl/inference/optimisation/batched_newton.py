@@ -39,6 +39,7 @@ CLOSE = 0.5  # nats that the quadratic still expects, from where on slopes take 
 GOOD = 1e-7  # that the quadratic still expects to gain, where a climb is at its end
 FINAL = 1e-3  # from where on differences are extrapolated to zero step
 NEAR = 1e-2  # likewise, where a climb that need not be precise is at its end
+CRAWL, PATIENCE = 0.02, 4  # nats that so many steps have not gained, one after the other: it ends
 LEAST_SCALE = 1e-3  # of outer products
 FORWARD, SLOPES, CURVATURES, FINE = 0, 1, 2, 3  # what a stencil tells
 
@@ -47,8 +48,9 @@ FORWARD, SLOPES, CURVATURES, FINE = 0, 1, 2, 3  # what a stencil tells
 class Climber:
     """One of the climbs. size : (F,) of its differences. path : where it has been. stale : whether
     second derivatives are to be taken anew; by_parts : whether outer products will do for that;
-    rough : whether those are all there is. told : what the last stencil was to tell. bent : (F,)
-    minus the second derivatives of the last part of a sum, where they were looked at."""
+    rough : whether those are all there is. told : what the last stencil was to tell. slow : how
+    many of the last steps gained next to nothing. bent : (F,) minus the second derivatives of the
+    last part of a sum, where they were looked at."""
 
     z: np.ndarray
     value: float
@@ -63,6 +65,7 @@ class Climber:
     by_parts: bool = False
     rough: bool = False
     told: int = FORWARD
+    slow: int = 0
     bent: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
@@ -110,9 +113,12 @@ def climb_together(function: Function, starts: np.ndarray, precise: bool = True)
             going = [c for c in going if c is best or c.value + HOPEFUL * c.distance > best.value]
         if not (going and further):
             break
+        was = {c: c.value for c in going}
         _step(function, going)
-        for c in climbers if not precise else ():
-            c.ended = c.ended or (c.distance < NEAR and c.told > FORWARD)
+        for c in going if not precise else ():
+            c.slow = c.slow + 1 if c.value - was[c] < CRAWL else 0
+            near = c.distance < NEAR and c.told > FORWARD
+            c.ended = c.ended or near or c.slow >= PATIENCE
     return max(climbers, key=lambda c: c.value)
 
 

@@ -195,3 +195,28 @@ def test_a_climb_goes_on_to_the_top_of_a_long_ridge():
 
     found = climb_together(parts, np.array([[-0.4, 0.7]]), precise=False)
     assert -summed(parts(found.z[None]))[0] < 5.0 * NEAR
+
+
+def test_a_climb_does_not_crawl_over_bumps(monkeypatch):
+    """Bumps that differences take for slopes: it ends half a nat from the top, and does not go on
+    from bump to bump."""
+
+    def bumpy(z):
+        return quadratic(z) + 1e-2 * np.sum(np.sin(3e3 * z), axis=1)
+
+    def points(patience):
+        monkeypatch.setattr(batched_newton, "PATIENCE", patience)
+        asked = []
+        rng = np.random.default_rng(6)
+        for start in rng.normal(size=(10, 1, 3)):
+
+            def counted(z):
+                asked.append(len(z))
+                return bumpy(z)
+
+            found = climb_together(counted, start, precise=False)
+            away = found.z - TOP
+            assert 0.5 * away @ H @ away < 1.0
+        return sum(asked)
+
+    assert points(batched_newton.PATIENCE) < points(10**6)
