@@ -197,26 +197,21 @@ def test_a_climb_goes_on_to_the_top_of_a_long_ridge():
     assert -summed(parts(found.z[None]))[0] < 5.0 * NEAR
 
 
-def test_a_climb_does_not_crawl_over_bumps(monkeypatch):
-    """Bumps that differences take for slopes: it ends half a nat from the top, and does not go on
-    from bump to bump."""
+def test_a_climb_does_not_crawl_along_a_winding_valley(monkeypatch):
+    """Where the top is a tenth of a nat away, and a step follows the valley for a hundredth."""
 
-    def bumpy(z):
-        return quadratic(z) + 1e-2 * np.sum(np.sin(3e3 * z), axis=1)
+    def winding(z):
+        return -1e4 * (z[:, 1] - np.sin(5.0 * z[:, 0])) ** 2 - 0.01 * (z[:, 0] - 3.0) ** 2
 
     def points(patience):
         monkeypatch.setattr(batched_newton, "PATIENCE", patience)
         asked = []
-        rng = np.random.default_rng(6)
-        for start in rng.normal(size=(10, 1, 3)):
 
-            def counted(z):
-                asked.append(len(z))
-                return bumpy(z)
+        def counted(z):
+            asked.append(len(z))
+            return winding(z)
 
-            found = climb_together(counted, start, precise=False)
-            away = found.z - TOP
-            assert 0.5 * away @ H @ away < 1.0
+        climb_together(counted, np.zeros((1, 2)), precise=False)
         return sum(asked)
 
-    assert points(batched_newton.PATIENCE) < points(10**6)
+    assert 3 * points(batched_newton.PATIENCE) < points(10**6)
