@@ -164,14 +164,15 @@ class SimulationGain:
     """What predictions more than one row ahead gain, in nats; the measure by which fits are ranked
     beside their likelihood.
 
-    At a horizon of h rows about one in h errors tells something new. With their variance unknown
-    the log-likelihood of R / h errors is -R / 2h log of their mean square, which rises by R / 2h
-    log(before / after); these are added over the horizons and the channels.
+    At a horizon of h rows about one in h errors of R rows tells something new, and no more than are
+    simulated. With their variance unknown the log-likelihood of n errors is -n / 2 log of their
+    mean square, which rises by n / 2 log(before / after); these are added over the horizons and the
+    channels.
 
     horizons : that count. window : rows of the simulations that the report leads with. rows : (K,)
     measured rows of each channel. before : (H + 1, K) mean squares of the model as it is, the last
-    row those of the windows. seed : of the simulations, the same for all models. origins : of these
-    at most, where a simulator allows few.
+    row those of the windows. seed : of the simulations, the same for all models. origins : of the
+    simulations, in all experiments.
     """
 
     horizons: tuple[int, ...]
@@ -179,7 +180,7 @@ class SimulationGain:
     rows: np.ndarray
     before: np.ndarray
     seed: np.random.SeedSequence
-    origins: float = np.inf
+    origins: int
 
     @classmethod
     def of(
@@ -192,7 +193,7 @@ class SimulationGain:
         nothing = np.full((len(horizons) + 1, len(rows)), np.nan)
         reach = min(window or max(1, round(WINDOW * longest)), max(longest // 2, 1))
         called = isinstance(fitter.smoother.extended, Extended)
-        origins = float(ORIGINS_CALLED * len(train)) if called else np.inf
+        origins = (ORIGINS_CALLED if called else ORIGINS) * len(train)
         out = cls(horizons, reach, rows, nothing, seed, origins)
         return replace(out, before=out.mean_squares(fitter, fit, train))
 

@@ -494,7 +494,7 @@ def test_a_pair_counts_what_it_adds_to_the_single_effect(monkeypatch, ahead, tak
 
 def test_what_a_better_place_for_the_model_simulates_is_no_gain_of_an_effect(monkeypatch):
     def gain(before):
-        return SimulationGain((3,), 5, np.array([60]), np.array(before), seed_sequence(1))
+        return SimulationGain((3,), 5, np.array([60]), np.array(before), seed_sequence(1), 60)
 
     place = SimpleNamespace(log_likelihood=10.0, error=0.0)
     fitter = SimpleNamespace(

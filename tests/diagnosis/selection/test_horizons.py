@@ -128,17 +128,17 @@ def test_a_simulation_that_goes_astray_is_infinitely_far_off():
 def test_the_gain_counts_one_in_so_many_rows():
     window = [1.0, 1.0]  # of no weight
     before = np.array([[1.0, 4.0], [2.0, np.nan], window])
-    gain = SimulationGain((3, 10), 9, np.array([90, 60]), before, seed_sequence(1))
+    gain = SimulationGain((3, 10), 9, np.array([90, 60]), before, seed_sequence(1), 60)
     assert gain.gain(before) == 0.0
     after = np.array([[0.5, 4.0], [2.0, np.nan], window])
     assert gain.gain(after) == pytest.approx(90 / 6 * np.log(2))
     after = np.array([[1.0, 4.0], [1.0, np.nan], window])
     assert gain.gain(after) == pytest.approx(90 / 20 * np.log(2))
-    assert replace(gain, origins=8.0).gain(after) == pytest.approx(8 / 2 * np.log(2))
+    assert replace(gain, origins=8).gain(after) == pytest.approx(8 / 2 * np.log(2))
     astray = np.full((3, 2), np.inf)
     largest = np.log(module.LARGEST_RATIO)
     assert gain.gain(astray) == pytest.approx(-(150 / 6 + 90 / 20) * largest)
-    nothing = SimulationGain((), 1, np.array([4]), np.ones((1, 1)), seed_sequence(1))
+    nothing = SimulationGain((), 1, np.array([4]), np.ones((1, 1)), seed_sequence(1), 60)
     assert nothing.gain(np.full((1, 1), 0.1)) == 0.0
 
 
