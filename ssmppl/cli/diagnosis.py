@@ -135,7 +135,8 @@ def _report_values(report: GapReport) -> dict[str, Any]:
     tables = {name: records(table) for name, table in report.tables().items()}
     return {
         "verdict": report.verdict, "chosen": report.chosen, "estimates": report.estimates,
-        **tables, "missing": tables.get("missing"), "complete": not len(report.left_out),
+        **tables, "missing": tables.get("missing"), "formula": tables.get("formula"),
+        "complete": not len(report.left_out),
         "parts": report.parts, "notes": report.notes,
         "settings": report.settings, "mode": report.mode, "seconds": report.seconds,
         "interrupted": report.interrupted,

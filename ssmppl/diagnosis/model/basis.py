@@ -109,7 +109,8 @@ class BasisTerm:
     """One basis function in one equation.
 
     moment : "mean" or "scale". variable : what it is a function of, in words. function : of a
-    single variable, with its centre and width; None of products and of what is past.
+    single variable, with its centre and width; None of products and of what is past. factors : the
+    variables, each with the number of its function in `CURVES`, from 1; none of what is past.
     """
 
     candidate: Candidate
@@ -119,6 +120,7 @@ class BasisTerm:
     function: Smooth | None = None
     centre: float = 0.0
     width: float = 1.0
+    factors: tuple[tuple[str, int], ...] = ()
 
     @property
     def is_curve(self) -> bool:
@@ -201,7 +203,9 @@ def _curve(part: Part, moment: str, kind: str, variable: Part, k: int, scales: S
         {"centre": scale.mean, "width": scale.sd}, {"z": variable},
         f"curve {k + 1} {moment} {part.label} {label}",
     )  # fmt: skip
-    return replace(found, function=curve, centre=scale.mean, width=scale.sd)
+    return replace(
+        found, function=curve, centre=scale.mean, width=scale.sd, factors=((label, k + 1),)
+    )
 
 
 def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[BasisTerm]:
@@ -211,15 +215,14 @@ def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Bas
     for a, b in combinations(variables, 2):
         x, y = scales.scale[a.label], scales.scale[b.label]
         shape = {"centre": x.mean, "width": x.sd, "centre_w": y.mean, "width_w": y.sd}
-        out += [
-            _term(
+        for i, j in degrees:
+            found = _term(
                 part, "mean", f"{a.label} and {b.label}",
                 f"product {i} {j} of {a.label} and {b.label}", "transition",
                 _product(CURVES[i - 1], CURVES[j - 1]), shape, {"z": a, "w": b},
                 f"product {i} {j} {part.label} {a.label} {b.label}",
-            )
-            for i, j in degrees
-        ]  # fmt: skip
+            )  # fmt: skip
+            out.append(replace(found, factors=((a.label, i), (b.label, j))))
     return out
 
 

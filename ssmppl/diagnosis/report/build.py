@@ -22,7 +22,7 @@ from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.verdict.decision import Decision, decide
 from ssmppl.diagnosis.verdict.results import Results
-from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP
+from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP, NONE_OF_THESE
 from ssmppl.errors import SSMError
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
@@ -43,7 +43,10 @@ def build_report(r: Results, seconds: float) -> GapReport:
     checks = table("detection", lambda: _detection(screen))
     order, found = table("classes", r.classes, ([], None))
     decision = decide(r, where, checks)
-    missing = _curve(r, decision)
+    missing, formula = _curve(r, decision), None
+    if decision.verdict == NONE_OF_THESE and decision.curve is not None:
+        with r.failures.guard("the table 'formula'"):
+            formula = tables.formula_table(screen, decision.curve, decision.others)
     if (
         decision.verdict == NO_GAP and not r.screen_is_current
     ):  # they are of a fit that was not the best one
@@ -93,6 +96,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
         verdict=decision.verdict, where=where, causes=causes, classes=classes, closed=share,
         detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
         free_run=free, not_applicable=_not_applicable(screen), missing=missing,
+        formula=formula,
         model=augmented, model_text=text, chosen=r.names if text else [], estimates=estimates,
         leading=leading, attributes=attributes, parts=_parts(r), notes=notes,
         settings={**r.settings, "candidates": len(set(screen.groups.tolist())),

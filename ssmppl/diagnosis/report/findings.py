@@ -32,6 +32,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "nats_per_sample", "F", "F_low", "F_high", "gain_mean", "gain_noise",
     ),
     "missing": ("equation", "variable", "value", "estimate", "low", "high"),
+    "formula": ("equation", "term", "coefficient", "se", "share"),
     "detection": ("channel", "statistic", "value", "z", "p"),
     "residual_map": ("equation", "t_from", "t_to", "z", "experiment"),
     "free_run": (
@@ -79,6 +80,7 @@ class Findings:
     free_run: pd.DataFrame
     not_applicable: pd.DataFrame
     missing: pd.DataFrame | None = None
+    formula: pd.DataFrame | None = None
     model: Model | None = None
     model_text: str = ""
     chosen: list[str] = field(default_factory=list)
@@ -115,7 +117,7 @@ class Findings:
         -------
         dict of DataFrames
             `where`, `causes`, `classes`, `closed` and the others above, and `left_out`; `missing`
-            only if there is one.
+            and `formula` only if there is one.
         """
         names = [f.name for f in fields(self) if f.name in COLUMNS]
         found = {name: getattr(self, name) for name in [*names, "left_out"]}

@@ -46,6 +46,9 @@ class GapReport(Findings):
         no after), with 95% bands.
     not_applicable : parts that do not apply to this model, the equation ("" if all), and why.
     missing : estimated curve of what is missing over a state, input or time, with a 95% band.
+    formula : where the verdict is "none of these", the terms of the formula that comes nearest to
+        what is missing, a suggestion: the increment of the equation's mean a row is the sum of
+        coefficient times term. `share` is that of the curves' gain which all of them have.
     model, model_text : the model with the chosen effects added, and its file; None and "" if
         nothing was chosen.
     chosen : labels of the chosen effects: the effect's name, or "<effect> on <equation>" where

@@ -12,6 +12,7 @@ from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, 
 from ssmppl.diagnosis.heldout.predictions import FreeRun
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.screening.location import BasisGroupScore, curve, localise, regions, when
+from ssmppl.diagnosis.screening.nearest_formula import nearest_formula
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.equivalence import Classes
 from ssmppl.diagnosis.selection.refit import Refit
@@ -124,6 +125,25 @@ def missing_table(
             rows.append({"equation": key[0], "variable": variable, "value": x, "estimate": e,
                          "low": low, "high": high})  # fmt: skip
     return tabulate("missing", rows)
+
+
+def formula_table(
+    screen: Screen, key: tuple[str, str], others: Sequence[Candidate]
+) -> pd.DataFrame | None:
+    """The nearest formula of the missing term, a row for each of its terms; None where no formula
+    comes near.
+
+    others : candidates that are projected out.
+    """
+    found = nearest_formula(screen, key, others)
+    if found is None:
+        return None
+    each = zip(found.terms, found.coefficients, found.errors, strict=True)
+    return tabulate("formula", [
+        {"equation": found.equation, "term": term, "coefficient": value, "se": error,
+         "share": found.share}
+        for term, value, error in each
+    ])  # fmt: skip
 
 
 def causes_table(

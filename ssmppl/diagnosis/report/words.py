@@ -344,8 +344,7 @@ def which(report: Findings) -> list[str]:
     """The effects that explain it, with their strength, and what they cannot be told from."""
     if report.verdict == NONE_OF_THESE:
         text = f"None of the {tried(report)}. The remaining misfit is significant"
-        curve = _curve_peak(report)
-        return [sentence(text), *([curve] if curve else [])]
+        return [sentence(text), *filter(None, [_curve_peak(report), formula(report)])]
     found = leaders(report)
     if not found:
         return [f"None of the {tried(report)} is significant."]
@@ -386,6 +385,22 @@ def _curve_peak(report: Findings) -> str:
     text = f"The estimated missing term in {top['equation']} is largest in magnitude at " \
            f"{top['variable']} = {number(top['value'])}: {number(top['estimate'])}"  # fmt: skip
     return f"{text} (95% band {number(top['low'])} to {number(top['high'])})."
+
+
+def formula(report: Findings) -> str:
+    """The formula that comes nearest to what is missing, as a suggestion."""
+    terms = rows(report.formula)
+    if not terms:
+        return ""
+    text = " ".join(
+        f"{'-' if r['coefficient'] < 0 else '+'} {number(abs(r['coefficient']))}*{r['term']}"
+        for r in terms
+    ).removeprefix("+ ")  # fmt: skip
+    return (
+        f"The nearest formula, a suggestion: an increment of {terms[0]['equation']} by {text} in "
+        f"each step. It has {percent(terms[0]['share'])} of the gain of the curves; another "
+        "formula may come as near."
+    )
 
 
 def _subject(row: dict[str, Any]) -> str:

@@ -35,7 +35,9 @@ from tests.diagnosis.made_up import ALL, NAN, effect_found, fast, no_gap, none_o
 
 def empty(verdict="no measurable gap", **fields):
     """A report that holds nothing."""
-    tables = {name: tabulate(name) for name in COLUMNS if name not in ("missing", "left_out")}
+    tables = {
+        name: tabulate(name) for name in COLUMNS if name not in ("missing", "formula", "left_out")
+    }
     return GapReport(verdict=verdict, **tables, **fields)
 
 
@@ -303,3 +305,16 @@ def test_a_report_refuses_what_it_does_not_know():
 def test_a_report_crosses_processes():
     report = effect_found()
     assert str(pickle.loads(pickle.dumps(report))) == str(report)
+
+
+def test_a_formula_is_told_as_a_suggestion():
+    found = dataclasses.replace(none_of_these(), formula=tabulate("formula", [
+        {"equation": "v", "term": "x**2", "coefficient": -0.31, "se": 0.02, "share": 0.86},
+        {"equation": "v", "term": "x*u", "coefficient": 0.1234, "se": 0.02, "share": 0.86},
+    ]))  # fmt: skip
+    text = " ".join(which(found))
+    assert "The nearest formula, a suggestion" in text
+    assert "an increment of v by - 0.31*x**2 + 0.123*x*u in each step" in text
+    assert "86% of the gain of the curves" in text
+    assert "formula" not in " ".join(which(none_of_these()))
+    assert list(found.tables()["formula"]["term"]) == ["x**2", "x*u"]
