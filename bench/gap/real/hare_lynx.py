@@ -4,13 +4,13 @@ Data: furs in thousands (D. A. MacLulich, Univ. Toronto Studies, 1937), as `asts
 h and l are the logarithms of hares / 30 and lynx / 20; rows are years.
 
 What such a model lacks: hares limit their own number by what they eat, so that they recover slowly
-and do not grow without end where there are few lynx (N. C. Stenseth, W. Falck, O. N. Bjornstad,
-C. J. Krebs, PNAS 94, 1997; C. J. Krebs et al., Science 269, 1995), and a lynx can eat only so many
-hares, which makes predation no product of the two (R. M. May, Science 177, 1972; A. A. King,
-W. M. Schaffer, Ecology 82, 2001). M. E. Gilpin (Am. Nat. 107, 1973) showed that the product alone
-fits these furs only with lynx eaten by hares. Right: a loss of the hares that grows with the hares
-(a stiffness, a stop, an extra loss, a drag in h), or a cross-coupling other than the product.
-Written down before the first run.
+and do not grow without end where there are few lynx (N. C. Stenseth, W. Falck, O. N. Bjornstad, C.
+J. Krebs, PNAS 94, 1997; C. J. Krebs et al., Science 269, 1995), and a lynx can eat only so many
+hares, which makes predation no product of the two (R. M. May, Science 177, 1972; A. A. King, W. M.
+Schaffer, Ecology 82, 2001). M. E. Gilpin (Am. Nat. 107, 1973) showed that the product alone fits
+these furs only with lynx eaten by hares. Right: a loss of the hares that grows with the hares (a
+stiffness, a stop, an extra loss, a drag in h), or a cross-coupling other than the product. Written
+down before the first run.
 """
 
 import numpy as np
@@ -43,8 +43,8 @@ def initial():
 
 
 @model.transition
-def transition(h, l, growth, eaten, gain, death, q):  # noqa: E741
-    def rates(h, l):  # noqa: E741
+def transition(h, l, growth, eaten, gain, death, q):
+    def rates(h, l):
         return {"h": growth - eaten * np.exp(l), "l": gain * np.exp(h) - death}
 
     new = ssm.integrate(rates, {"h": h, "l": l}, 1.0, steps=4)
@@ -52,7 +52,7 @@ def transition(h, l, growth, eaten, gain, death, q):  # noqa: E741
 
 
 @model.observation
-def observation(h, l, r):  # noqa: E741
+def observation(h, l, r):
     return {"hares": ssm.Normal(h, sd=r), "lynx": ssm.Normal(l, sd=r)}
 
 

@@ -4,8 +4,8 @@ Data: 33 days by the hour of the tutorials of `darkgreybox` (Ti, Ta, Ph), which 
 archive carries. T is the temperature inside, `outside` that outside, both in degrees C, `heating`
 the power of the heating (in units of 10 of the file's).
 
-What such a model lacks: a second thermal mass, of the walls or of the radiators (P. Bacher,
-H. Madsen, Energy and Buildings 43, 2011, who start from this very model and add those first), and
+What such a model lacks: a second thermal mass, of the walls or of the radiators (P. Bacher, H.
+Madsen, Energy and Buildings 43, 2011, who start from this very model and add those first), and
 gains that nobody recorded, the sun's by day among them (Bacher and Madsen; the tutorial says so of
 its own data). Right: a lag or a delay of an input or of the sensor, or a forcing of 24 hours, one
 more or less. An input that was not recorded, with no more said, is wrong here. Written down before

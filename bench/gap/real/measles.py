@@ -7,10 +7,10 @@ before (the age at which school began to matter), thousands in two weeks; `log_c
 of the cases.
 
 What such a model lacks: transmission is high in school terms and low in the holidays (H. E. Soper,
-J. R. Statist. Soc. 92, 1929; P. E. M. Fine, J. A. Clarkson, Int. J. Epidemiology 11, 1982;
-B. F. Finkenstadt, B. T. Grenfell, Applied Statistics 49, 2000; D. He, E. L. Ionides, A. A. King,
-J. R. Soc. Interface 7, 2010). Right: a periodic forcing with the period of a year, 26 rows, one more
-or less. Written down before the first run.
+J. R. Statist. Soc. 92, 1929; P. E. M. Fine, J. A. Clarkson, Int. J. Epidemiology 11, 1982; B. F.
+Finkenstadt, B. T. Grenfell, Applied Statistics 49, 2000; D. He, E. L. Ionides, A. A. King, J. R.
+Soc. Interface 7, 2010). Right: a periodic forcing with the period of a year, 26 rows, one more or
+less. Written down before the first run.
 """
 
 import numpy as np
@@ -41,13 +41,13 @@ def initial():
 
 
 @model.transition
-def transition(l, s, births, beta, q):  # noqa: E741
+def transition(l, s, births, beta, q):
     left = np.maximum(s + births - np.exp(l), 1.0)
     return {"l": ssm.Normal(np.log(beta * left) + l, sd=q), "s": ssm.Dirac(left)}
 
 
 @model.observation
-def observation(l, reported, r):  # noqa: E741
+def observation(l, reported, r):
     return {"log_cases": ssm.Normal(np.log(1000.0 * reported) + l, sd=r)}
 
 

@@ -1,11 +1,11 @@
 """The annual flow of the Nile at Aswan, 1871 to 1970, about a fixed level.
 
-Data: `nile` of `statsmodels` (also in every copy of R). y is in 1e8 cubic metres; x the flow without
-what is peculiar to one reading.
+Data: `nile` of `statsmodels` (also in every copy of R). y is in 1e8 cubic metres; x the flow
+without what is peculiar to one reading.
 
 What such a model lacks: the flow drops by a quarter in 1899, when the dam at Aswan is begun and the
-rains over the tropics weaken (G. W. Cobb, Biometrika 65, 1978; N. S. Balke, J. Bus. Econ. Statist. 11,
-1993; J. Durbin, S. J. Koopman, Time Series Analysis by State Space Methods, 2001, chapter 2).
+rains over the tropics weaken (G. W. Cobb, Biometrika 65, 1978; N. S. Balke, J. Bus. Econ. Statist.
+11, 1993; J. Durbin, S. J. Koopman, Time Series Analysis by State Space Methods, 2001, chapter 2).
 Right: a break of a parameter or of the level from 1897 to 1901, rows 27 to 31. Written down before
 the first run.
 """

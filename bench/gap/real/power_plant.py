@@ -1,12 +1,12 @@
 """The pressure of the steam of a 120 MW power plant, of first order in the five inputs.
 
-Data: the plant at Pont-sur-Sambre in normal operation, 200 rows of 20 minutes (R. P. Guidorzi,
-P. Rossi, Automatic Control Theory and Applications 2, 1974; of the collection DaISy, B. De Moor et
-al., IFAC SYSID 1997), standardised, as `simbapy` carries them. Inputs: flow of the gas, opening of the
-turbine's valves, flow of the spray, opening of the gas dampers, flow of the air.
+Data: the plant at Pont-sur-Sambre in normal operation, 200 rows of 20 minutes (R. P. Guidorzi, P.
+Rossi, Automatic Control Theory and Applications 2, 1974; of the collection DaISy, B. De Moor et
+al., IFAC SYSID 1997), standardised, as `simbapy` carries them. Inputs: flow of the gas, opening of
+the turbine's valves, flow of the spray, opening of the gas dampers, flow of the air.
 
-What such a model lacks: fire, water, steam and metal store heat one after the other, and the plant is
-identified with several states an output (P. Moonen, B. De Moor, L. Vandenberghe, J. Vandewalle,
+What such a model lacks: fire, water, steam and metal store heat one after the other, and the plant
+is identified with several states an output (P. Moonen, B. De Moor, L. Vandenberghe, J. Vandewalle,
 Int. J. Control 49, 1989). Right: a lag or a delay of an input or of the sensor. Nothing in the
 literature singles one out, so the rule is wide. Written down before the first run.
 """

@@ -8,15 +8,17 @@ Each case gets a simple model and no hint, seed 1. NAME is a case (all without o
 `hare_lynx`, `beaver`, `nile`, `house`, `cooling_water`, `electricity`, `power_plant`, with models
 in this folder and data that packages carry; `emps`, `silverbox`, `tclab`, with models and data in
 `cases/` of PATH (or of $SSMPPL_SHARED, or of ../shared); `multisine`, `drives1`, `drives2`, with
-models in this folder and data in `data/` of PATH. What is not there is skipped, and the run says what
-it needs. What counts as right was written down before the first run, in the models' files and below.
+models in this folder and data in `data/` of PATH. What is not there is skipped, and the run says
+what it needs. What counts as right was written down before the first run, in the models' files and
+below.
 
 A report goes to OUT/NAME, and one line, which is printed too, to OUT/NAME.json: the headline, the
 error of simulations over the default horizon on rows not used, before and after, the grade
 (`answers.py`) and the seconds. `--table` prints the lines that are there.
 
 The model that `multisine` gives back is also compared with the linear one on the part of the
-Silverbox's record with growing amplitude, by the error of a simulation that never looks at the answers.
+Silverbox's record with growing amplitude, by the error of a simulation that never looks at the
+answers.
 """
 
 from __future__ import annotations
@@ -99,13 +101,13 @@ def spring(n: Named) -> bool:
 
 
 def second_mass(n: Named) -> bool:
-    """The Temperature Control Lab: J. Park, R. A. Martin, J. D. Kelly, J. D. Hedengren, Computers and
-    Chemical Engineering 135, 2020: heater and sensor each have a time constant."""
+    """The Temperature Control Lab: J. Park, R. A. Martin, J. D. Kelly, J. D. Hedengren, Computers
+    and Chemical Engineering 135, 2020: heater and sensor each have a time constant."""
     return n.among("actuator lag", "sensor lag")
 
 
 def unsigned(n: Named) -> bool:
-    """The coupled drives: Wigren and Schoukens, report 2017-024: the sensor does not tell the sign."""
+    """The drives: Wigren and Schoukens, report 2017-024: the sensor does not tell the sign."""
     return n.among("sensor rectification")
 
 
