@@ -218,6 +218,7 @@ def test_an_effect_that_is_named_has_its_shape():
         ("hare_lynx", "extra loss", "sensor lag"),
         ("beaver", "parameter break: relative, date = 41", "parameter break: date = 60"),
         ("nile", "level break: date = 28", "parameter drift: rows = 28"),
+        ("nile", "parameter break: relative, date = 31", "parameter break: date = 32"),
         ("house", "actuator lag: k = 4", "missing input"),
         ("house", "periodic forcing: period = 24.1", "periodic forcing: period = 12"),
         ("cooling_water", "quadratic stiffness", "parameter drift"),
@@ -241,6 +242,7 @@ def test_a_loss_of_the_lynx_is_no_loss_of_the_hares():
 
 
 def test_a_table_has_a_dash_for_what_was_not_measured():
-    found = {"case": "x", "rows": 3, "before": 0.12345, "after": float("nan"), "grade": "wrong"}
+    found = {"case": "x", "rows": 3, "before": 0.12345, "after": float("nan"), "grade": "wrong",
+             "known": "gives |v|"}  # fmt: skip
     last = run.table([found]).splitlines()[-1]
-    assert last == "| x | 3 | - | - | 0.123 | - | - | wrong | - |"
+    assert last == r"| x | 3 | gives \|v\| | - | 0.123 | - | - | wrong | - |"

@@ -167,7 +167,7 @@ def table(lines: list[dict[str, Any]]) -> str:
 def cell(value: Any) -> str:
     if value is None or value != value:
         return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value).replace("|", "\\|")
 
 
 def run_free(model: ssm.Model, values: Mapping[str, float], data: pd.DataFrame) -> np.ndarray:
