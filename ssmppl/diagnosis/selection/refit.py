@@ -7,6 +7,7 @@ expects its top, with what predictions further ahead than one row gain.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,8 +15,14 @@ from functools import partial
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.effects.candidate import Candidate, refine_wave, starts_of
-from ssmppl.diagnosis.effects.effect import ASKED
+from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, refine_wave, starts_of
+from ssmppl.diagnosis.effects.effect import (
+    ASKED,
+    CHANGE_IN_TIME,
+    MECHANISM,
+    NOISE_LAW,
+    UNKNOWN_INPUT,
+)
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import (
     APPROXIMATELY,
@@ -38,13 +45,16 @@ from ssmppl.inference.run.seeds import random_state
 
 # Which candidates are refitted.
 SINGLES, CORRELATED, PAIRS = 5, 4, 3  # leading ones, further ones like the best of them, pairs
+MOST_OF_A_KIND = {CHANGE_IN_TIME: 2, UNKNOWN_INPUT: 2, NOISE_LAW: 1}  # of the leading ones
+MOST_OF_NO_CAUSE = 3  # likewise, of these together
 PAIRED = 12  # leading ones of which pairs are made
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 LEAST_PAIR_GAIN = 2.0  # nats that it must promise of a pair beyond the best single one
 ALIKE = 0.8  # correlation with the best from which a candidate is refitted beside it
 SAME = 0.95  # beyond which two candidates are one to begin with
 SAME_IN_PAIR = 0.98  # beyond which they make no pair
-NEAR = 25.0  # nats behind the best, up to which other delays are tried
+NEAR = 25.0  # nats behind the best, up to which other delays and dates are tried
+NEIGHBOURS = 6  # dates
 ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
 
 EXPLAINED = 0.5  # of the score of an unknown input, by a mechanism that is named in its place
@@ -241,12 +251,30 @@ def start_at(
 
 def leading(screen: Screen) -> list[int]:
     """The best shape of each of the best groups, the highest first; of those that are almost the
-    same as one above them none."""
-    out: list[int] = []
+    same as one above them none, unless they are asked earlier (`ASKED`), whose place they take.
+
+    What fits any misfit stands high at a fit far from the truth: of changes in time, of unknown
+    inputs and of laws of the noise there are `MOST_OF_A_KIND` each and `MOST_OF_NO_CAUSE` in all,
+    as long as causes promise anything.
+    """
+    cause = [screen.design.candidates[k].effect.cause for k in range(len(screen.groups))]
+    different: list[int] = []
     for k in _promising(screen):
-        if len(out) < SINGLES and all(abs(screen.efficient.rho[k, j]) < SAME for j in out):
-            out.append(k)
-    return out
+        same = [j for j in different if abs(screen.efficient.rho[k, j]) >= SAME]
+        if all(ASKED[cause[k]] < ASKED[cause[j]] for j in same):
+            different = [j for j in different if j not in same] + [k]
+    counts, first, later = Counter[str](), [], []
+    for k in different:
+        kind = cause[k]
+        if kind != MECHANISM:
+            no_cause = sum(n for c, n in counts.items() if c != MECHANISM)
+            if counts[kind] >= MOST_OF_A_KIND[kind] or no_cause >= MOST_OF_NO_CAUSE:
+                later.append(k)
+                continue
+        counts[kind] += 1
+        first.append(k)
+    taken = set((first + later)[:SINGLES])
+    return [k for k in different if k in taken]
 
 
 def correlated_candidates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
@@ -261,15 +289,20 @@ def correlated_candidates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
 
 
 def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
-    """The other numbers of states, as delays are, of those near the best that have one: nothing
-    between two of them can be estimated."""
+    """The other numbers of states, as delays are, of those near the best that have one, and the
+    dates next to those that are dated: nothing between two of them can be estimated."""
     near = [r.index[0] for r in refits if refits[0].penalised_gain - r.penalised_gain <= NEAR]
     out: list[int] = []
     for best in near:
         c = screen.design.candidates[best]
+        every = np.flatnonzero(screen.groups == screen.groups[best]).tolist()
+        group = [k for k in every if k != best and not screen.efficient.status[k]]
         if any(c.effect.states.values()) and len(out) < CORRELATED:
-            group = np.flatnonzero(screen.groups == screen.groups[best])
-            out += [int(k) for k in group if k != best and not screen.efficient.status[k]]
+            out += group
+        elif is_dated(c) and len(out) < CORRELATED:
+            dates = {k: float(dict(screen.design.candidates[k].shape)["date"]) for k in group}
+            own = float(dict(c.shape)["date"])
+            out += sorted(group, key=lambda k: abs(dates[k] - own))[:NEIGHBOURS]
     return out
 
 

@@ -40,10 +40,13 @@ from tests.statistics.checks import seed_of
 
 
 # -- which
-def screen_of(heights, rho, shapes=None):
-    """A screen with one column for each group, but for groups with more shapes."""
+def screen_of(heights, rho, kinds=""):
+    """A screen with one column for each group. kinds : the first letters of their kinds."""
     heights, count = np.asarray(heights, float), len(heights)
+    names = {"m": "mechanism", "c": "change in time", "u": "unknown input", "n": "noise law"}
+    causes = [SimpleNamespace(effect=SimpleNamespace(cause=names[k])) for k in kinds or "m" * count]
     return SimpleNamespace(
+        design=SimpleNamespace(candidates=causes),
         family=SimpleNamespace(leaders=np.argsort(-heights, kind="stable").tolist()),
         efficient=SimpleNamespace(gain=0.5 * heights**2, status=("",) * count, rho=np.asarray(rho)),
         groups=np.arange(count),
@@ -56,6 +59,30 @@ def test_what_is_almost_the_same_as_one_above_it_waits():
     rho[2, 4] = rho[4, 2] = -0.97
     found = leading(screen_of([9.0, 8.9, 7.0, 6.0, 5.0, 4.0, 1.2], rho))
     assert found == [0, 2, 3, 5]  # the last promises less than a nat
+
+
+def test_a_cause_takes_the_place_of_a_change_in_time_that_is_almost_the_same():
+    """A loss that grows stands behind a drift of a parameter with which it correlates."""
+    rho = np.eye(3)
+    rho[0, 1] = rho[1, 0] = 0.99
+    assert leading(screen_of([9.0, 8.0, 7.0], rho, "cmm")) == [1, 2]
+    assert leading(screen_of([9.0, 8.0, 7.0], rho, "ccm")) == [0, 2]
+    assert leading(screen_of([9.0, 8.0, 7.0], rho, "mcm")) == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "found"),
+    [
+        ("cccccmmm", [0, 1, 5, 6, 7]),
+        ("cuccunnmm", [0, 1, 2, 7, 8]),
+        ("nnnummmm", [0, 3, 4, 5, 6]),
+        ("cccnnm", [0, 1, 2, 3, 5]),  # too few causes: what waited fills up, the highest first
+        ("mmmmmmc", [0, 1, 2, 3, 4]),
+    ],
+)
+def test_places_are_kept_for_causes(kinds, found):
+    heights = 9.0 - 0.5 * np.arange(len(kinds))
+    assert leading(screen_of(heights, np.eye(len(kinds)), kinds)) == found
 
 
 def test_what_is_like_the_best_refit_comes_next():
@@ -222,13 +249,30 @@ def refit_at(k, penalised_gain):
 
 def delayed_screen():
     """Columns 0 to 2 are the delays of one effect, 3 is an effect without, 4 and 5 another's."""
-    delayed = SimpleNamespace(effect=SimpleNamespace(states={"past": "delay"}))
-    plain = SimpleNamespace(effect=SimpleNamespace(states={"held": None}))
+    delayed = SimpleNamespace(effect=SimpleNamespace(states={"past": "delay"}, profile=""))
+    plain = SimpleNamespace(effect=SimpleNamespace(states={"held": None}, profile=""))
     return SimpleNamespace(
         design=SimpleNamespace(candidates=[delayed] * 3 + [plain] + [delayed] * 2),
         groups=np.array([7, 7, 7, 3, 8, 8]),
         efficient=SimpleNamespace(status=["", "", "too little", "", "", ""]),
     )
+
+
+def test_dates_next_to_that_of_a_break_near_the_best_are_refitted():
+    def dated(day, profile="step"):
+        return SimpleNamespace(
+            effect=SimpleNamespace(states={}, profile=profile), shape=(("date", float(day)),)
+        )
+
+    days = [3, 9, 10, 11, 12, 13, 14, 15, 40]
+    screen = SimpleNamespace(
+        design=SimpleNamespace(candidates=[dated(d) for d in days] + [dated(12, "pulse")]),
+        groups=np.array([1] * 9 + [2]),
+        efficient=SimpleNamespace(status=["", "", "", "too little"] + [""] * 6),
+    )
+    found = delays(screen, [refit_at(4, 10.0)])
+    assert sorted(days[k] for k in found) == [3, 9, 10, 13, 14, 15]
+    assert delays(screen, [refit_at(0, 100.0), refit_at(4, 10.0)])[:1] == [1]
 
 
 def test_other_delays_of_those_near_the_best_are_refitted():
@@ -304,7 +348,7 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
     monkeypatch.setattr(EffectSelection, "_best_pair", lambda *_: None)
     monkeypatch.setattr(EffectSelection, "_forward", forward)
     screen = screen_of([6.0, 3.0], np.eye(2))
-    screen.design, screen.family.maxima = SimpleNamespace(scales=None), np.full(60, 2.0)
+    screen.design.scales, screen.family.maxima = None, np.full(60, 2.0)
     out = SelectionResult(None)
     kept = Checkpoint(None, {})
     EffectSelection(
