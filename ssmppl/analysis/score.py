@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from textwrap import shorten
 
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.structure import component_means, deterministic
@@ -28,6 +29,7 @@ from ssmppl.expressions.expr import Expr, constant, dependent, symbol, symbols_o
 from ssmppl.language.model.trace import Site, Trace, previous
 
 ROLES = ("initial", "transition", "observation")
+TEXT = 120  # characters of an expression in a reason
 Sensitivity = tuple[Expr, tuple[Expr, ...]]  # a component, and the parameters it is derived in
 
 
@@ -120,9 +122,10 @@ class CompleteScore:
                 continue
             for node in topological(roots):  # the first of them
                 if jumps(node) and node in changing:
+                    text = shorten(repr(node), TEXT, placeholder=" ...")
                     return NotApplicable(
                         f"the distribution of {site.name} changes by steps in {parameter!r}, by "
-                        f"{node!r}",
+                        f"{text}",
                         where,
                     )
         return None

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ssmppl.diagnosis.report.findings import Findings
 
 NAMED_RIVALS = 3
+PICTURED = 3.0  # nats a row, up to which a ratio of densities is a picture of them
 MOMENTS = {
     "mean": "the mean of",
     "scale": "the noise variance of",
@@ -445,8 +446,9 @@ def how_far(report: Findings) -> list[str]:
         return out
     if is_number(first["nats_per_sample"]):
         nats = float(first["nats_per_sample"])
-        text = f"mean gain in log predictive density {number(nats, 2)} nats per sample (a " \
-               f"density ratio of {number(math.exp(nats))})"  # fmt: skip
+        text = f"mean gain in log predictive density {number(nats, 2)} nats per sample"
+        if abs(nats) <= PICTURED:
+            text += f" (a density ratio of {number(math.exp(nats))})"
         if is_number(first["gain_mean"]) and is_number(first["gain_noise"]):
             text += f"; in all {number(first['gain_mean'], 2)} nats from the conditional mean, " \
                     f"{number(first['gain_noise'], 2)} from the rest of the predictive " \

@@ -400,7 +400,7 @@ def refit_all(
         gain = fit.log_likelihood - base.log_likelihood
         if gain < -LOST - 3.0 * np.hypot(fit.error, base.error):
             reasons.append(
-                f"{name}: the optimiser failed: log-likelihood {-gain:.0f} nats below the nested "
+                f"{name}: the optimiser failed: log-likelihood {-gain:.3g} nats below the nested "
                 "base model"
             )
             continue

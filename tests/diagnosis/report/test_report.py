@@ -206,6 +206,9 @@ def test_where_names_the_places_that_stand_out_and_no_others():
 def test_how_far_says_what_moved_and_which_way():
     good = " ".join(how_far(effect_found()))
     assert f"a density ratio of {number(math.exp(0.0812))}" in good
+    found = effect_found()
+    far = dataclasses.replace(found, closed=found.closed.assign(nats_per_sample=-73.9))
+    assert "density ratio" not in " ".join(how_far(far))
     assert "decreases from 0.213 to 0.094" in good
     assert "t = 711 to 1000" in good
     assert "increases from 0.2 to 0.22" in " ".join(how_far(several()))
