@@ -320,11 +320,12 @@ class EffectSelection:
                 return
             if float(np.min(again.family.p, initial=1.0)) > CLOSER_LOOK_FACTOR * self.alpha:
                 return
-            more, _ = self._refit(
+            more, failed = self._refit(
                 out, chosen.fit, again, [[k] for k in leading(again)[:FOLLOWERS]],
                 child_seed(seed, Task.FURTHER_REFITS + number), "refitting", chosen.candidates,
                 checkpoint=self.checkpoint.within(f"with {number + 1} effects"),
             )  # fmt: skip
+            out.notes += [f"not refitted: {reason}" for reason in failed]
             worth, so_far = critical_gain(again, self.alpha), chosen.ahead
             more = [replace(r, ahead=r.ahead - so_far) for r in more]
             more = [

@@ -516,12 +516,13 @@ def test_a_step_forward_counts_what_it_adds(monkeypatch, ahead, taken):
     monkeypatch.setattr(module, "_others", lambda *_: [effect])
     monkeypatch.setattr(module, "leading", lambda *_: [0])
     monkeypatch.setattr(module, "critical_gain", lambda *_: 8.0)
-    monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([more], []))
+    monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([more], ["it failed"]))
     monkeypatch.setattr(EffectSelection, "_screen_again", lambda *_: again)
     screen = SimpleNamespace(design=SimpleNamespace(candidates=[effect]))
     out = SelectionResult(None, chosen=chosen)
     choice_of(screen, settings=SimpleNamespace(particles=1))._forward(out, 2)
     assert (len(out.chosen.candidates) == 2) is taken
+    assert out.notes == ["not refitted: it failed"]
     if taken:
         assert (out.chosen.gain, out.chosen.ahead) == (70.0, ahead)
 
