@@ -36,6 +36,8 @@ EIGENVALUE_CUT = 1e-10  # of I_theta,theta in correlation units: below it is rou
 ABSORBED = 0.03
 LARGEST_SKEWNESS = float(np.sqrt(8.0))  # of a quadratic form in normals: one squared normal's
 CONSTANT = "constant across simulated data sets"
+SELDOM = "zero in almost all simulated data sets"
+FEWEST_TELLING = 8  # sets in which a column is not zero, without which it says nothing
 TAKEN = "not identifiable (collinear with the parameters)"
 DROWNED = "smaller than the smoother's Monte Carlo error"
 SPARE_SETS = 20  # degrees of freedom without which a residual variance says nothing
@@ -166,7 +168,7 @@ class Efficient:
     of S~ (those between candidates that carry independent Monte Carlo noise come out too small by
     `noise_share`). statistic, null : (K,), (B, K) studentised, for `familywise`; zero where status
     is not "". noise_share : (K,) of the variance that is the smoother's.
-    status : "" or why a column says nothing: `CONSTANT`, `TAKEN` or `DROWNED`.
+    status : "" or why a column says nothing: `CONSTANT`, `SELDOM`, `TAKEN` or `DROWNED`.
     """
 
     score: np.ndarray
@@ -195,6 +197,10 @@ def efficient(null: Null, columns: np.ndarray, nuisance: np.ndarray) -> Efficien
     V is the residual variance less the smoother's, yet at least two standard errors of the
     residual variance itself (a relative 2 sqrt(2 / dof)): less than that, these sets cannot tell
     from zero, and dividing by it would make strengths out of noise.
+
+    A column that is zero in a set says nothing there: what acts where a state seldom goes. V is
+    that of the sets in which it says something, or one of few would lie as far out as there are
+    others; of fewer than `FEWEST_TELLING` of these there is none.
     """
     columns, nuisance = np.asarray(columns, float), np.asarray(nuisance, float)
     sets, width = null.columns.shape
@@ -214,6 +220,9 @@ def efficient(null: Null, columns: np.ndarray, nuisance: np.ndarray) -> Efficien
         size = np.sqrt(fit.spread * (1.0 + fit.leverage_of(nuisance)))
         t[which] = np.divide(score[which], size, out=np.zeros_like(size), where=size > 0.0)
         null_t[:, which] = fit.studentised
+    telling = np.mean(null.columns != 0.0, axis=0)
+    by = np.where(telling > 0.0, np.sqrt(telling), 1.0)
+    total, info, t, null_t = total / by**2, info / by**2, t * by, null_t * by
     floor = 2.0 * np.sqrt(2.0 / dof)
     variance = np.maximum(total - null.noise, floor * total)
     info_left = np.maximum(info - null.noise, floor * info)
@@ -222,6 +231,8 @@ def efficient(null: Null, columns: np.ndarray, nuisance: np.ndarray) -> Efficien
     left = total - null.noise
     constant = info <= (1e-12 * np.max(np.abs(null.columns), axis=0, initial=0.0)) ** 2
     silent = constant | (left <= ABSORBED**2 * info_left + floor * np.minimum(null.noise, total))
+    seldom = ~constant & (telling * sets < FEWEST_TELLING)
+    silent |= seldom
     drowned = silent & ~constant & (null.noise > 0.5 * info)
     kappa[silent] = np.sqrt(np.clip(_ratio(left, info_left), 0.0, 1.0))[silent]
     t[silent], null_t[:, silent] = 0.0, 0.0
@@ -234,7 +245,8 @@ def efficient(null: Null, columns: np.ndarray, nuisance: np.ndarray) -> Efficien
         np.where(silent, 0.0, _ratio(score, variance)), kappa, _correlation(residuals, silent),
         t, null_t, np.minimum(_ratio(null.noise, total), 1.0),
         np.where(null.quadratic, 1, null.sided),
-        tuple(np.select([constant, drowned, silent], [CONSTANT, DROWNED, TAKEN], "").tolist()),
+        tuple(np.select([constant, seldom, drowned, silent],
+                        [CONSTANT, SELDOM, DROWNED, TAKEN], "").tolist()),
     )  # fmt: skip
 
 
