@@ -14,7 +14,7 @@ scatter of the seeds' slopes at the top gives the estimate's Monte Carlo error.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -36,7 +36,9 @@ from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.batched_newton import climb_together, parts_of, summed
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
+from ssmppl.inference.optimisation.units import units_at
 from ssmppl.inference.preparation.exact_models import ExactModel, likelihood_by
+from ssmppl.inference.preparation.pilot import UNITS
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.invalid_laws import total_of
@@ -262,7 +264,7 @@ class _WithoutMaximum(Exception):
 
 
 class ExactClimb:
-    """Ascent of an exact log-likelihood with its exact score."""
+    """Ascent of an exact log-likelihood with its exact score, in units in which it changes."""
 
     def __init__(self, setup: Maximization, model: ExactModel, method: DirectOptimization):
         self.setup, self.model, self.method = setup, model, method
@@ -275,6 +277,8 @@ class ExactClimb:
         self.evaluations = 0
         self.held: Edges | None = None
         self.known: dict[bytes, float] = {}  # objective at the points since the last iterate
+        self.unit = np.ones(len(setup.space.positions))  # (F,) what a climb takes for one
+        self.fitted = np.full(len(self.unit), np.nan)  # z where that was measured last
 
     def run(self) -> Ascent:
         """All climbs, and Newton's steps from the best point."""
@@ -334,16 +338,17 @@ class ExactClimb:
         for k in range(1, restarts + 1):
             rng = np.random.default_rng(self.setup.seed(k))
             centre = self.best if len(self.best) else self.setup.start
-            yield centre + rng.standard_normal(len(centre))
+            yield centre + self.unit * rng.standard_normal(len(centre))
 
     def _short_climbs(self) -> list[np.ndarray]:
         """Where the best of many short climbs ended."""
         found = []
+        self._fit_units(self.setup.start)
         for k in range(1, SHORT_CLIMBS + 1):
             rng = np.random.default_rng(self.setup.seed(k))
             iterates: list[np.ndarray] = []
-            start = self.setup.start + SPREAD * rng.standard_normal(len(self.setup.start))
-            quasi_newton(self.value, start, SHORT_STEPS, iterates.append)
+            away = SPREAD * self.unit * rng.standard_normal(len(self.unit))
+            self._in_units(self.setup.start + away, SHORT_STEPS, iterates.append)
             found.append((self.value(iterates[-1])[0], iterates[-1]))
         self.known.clear()
         return [z for _, z in sorted(found, key=lambda one: -one[0])[:GONE_ON_WITH]]
@@ -380,7 +385,45 @@ class ExactClimb:
             raise _WithoutMaximum(reason.reason)
 
     def _quasi_newton(self, start: np.ndarray) -> str:
-        return quasi_newton(self.value, start, self.method.steps, self._remember)
+        """A climb from start (F,), gone on with where other units fit at its end."""
+        end, stopped = start, ""
+
+        def visit(z: np.ndarray) -> None:
+            nonlocal end
+            end = z
+            self._remember(z)
+
+        self._fit_units(start)
+        for _ in range(UNITS):
+            before = self.unit
+            stopped = self._in_units(end, self.method.steps, visit)
+            self._fit_units(end)
+            if np.array_equal(self.unit, before):
+                break
+        return stopped
+
+    def _in_units(self, start: np.ndarray, steps: int, visit: Callable[[np.ndarray], None]) -> str:
+        """A climb in steps of the units, of at most so many; as `quasi_newton`."""
+        unit = self.unit
+
+        def value(v: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = self.value(unit * v)
+            return value, unit * slope
+
+        return quasi_newton(value, start / unit, steps, lambda v: visit(unit * v))
+
+    def _fit_units(self, z: np.ndarray) -> None:
+        """Units that fit the objective round z (F,), of numbers of the whole line, which may be of
+        any size; those of logarithms and shares stay one."""
+        if not np.array_equal(z, self.fitted):
+            self.unit = units_at(self._objective, z, self.unit, self.setup.space.on_the_line)
+            self.fitted = z
+
+    def _objective(self, z: np.ndarray) -> float:
+        try:
+            return self.setup.exact_objective(z)
+        except SamplingError:
+            return -np.inf
 
     def _leave_flats(self) -> None:
         """Climb again from the other side of a flat stretch: a spread that is a millionth of the
@@ -388,7 +431,7 @@ class ExactClimb:
         for _ in range(FLATS):
             z, before = self.best, self.best_value
             curvature = np.diagonal(_curvature(self.setup, self.exact, z))
-            for j in np.flatnonzero(curvature < FLAT):
+            for j in np.flatnonzero(curvature * self.unit**2 < FLAT):
                 for step in (sign * s for s in INWARDS for sign in (-1.0, 1.0)):
                     there = z.copy()
                     there[j] += step
@@ -416,7 +459,7 @@ class ExactClimb:
         for _ in range(NEWTON_STEPS):
             value, slope = self.value(self.best)
             curvature = _curvature(self.setup, exact, self.best)[np.ix_(kept, kept)]
-            if not np.all(np.isfinite(curvature)) or _lowest(curvature) <= 0.0:
+            if not _positive_definite(curvature):
                 return np.inf
             slope, step = slope[kept], np.zeros(len(kept))
             step[kept] = np.linalg.solve(curvature, slope)
@@ -543,6 +586,15 @@ def _curvature(setup: Maximization, exact: Any, z: np.ndarray) -> np.ndarray:
     second = setup.transform.curvature(z, gradient)
     out = point.jacobian.T @ exact.information(point.theta) @ point.jacobian - second.theta
     return out - second.log_prior if setup.with_prior else out
+
+
+def _positive_definite(matrix: np.ndarray) -> bool:
+    """Whether it is, as a matrix of correlations: rounding of its largest entries says nothing of
+    the others, which are in other units."""
+    with np.errstate(all="ignore"):
+        scale = np.sqrt(np.diagonal(matrix))
+        scaled = matrix / np.outer(scale, scale)
+    return bool(np.all(np.isfinite(scaled))) and _lowest(scaled) > 0.0
 
 
 def _lowest(matrix: np.ndarray) -> float:

@@ -76,8 +76,9 @@ def edges(
     z = _inside(setup, theta)
     jacobian = setup.transform.at(z).jacobian
     with np.errstate(all="ignore"):
-        if np.all(np.einsum("pf,pq,qf->f", jacobian, information, jacobian) > FLAT):
-            return None
+        plain = np.einsum("pf,pq,qf->f", jacobian, information, jacobian) > FLAT
+    if np.all(plain | setup.space.on_the_line):
+        return None
     found = directions(objective or setup.exact_objective, z)
     if not found.any():
         return None
