@@ -19,6 +19,7 @@ from ssmppl.diagnosis.model.scales import Scales, value_of
 from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
+from ssmppl.expressions.calculus import jumps
 from ssmppl.expressions.expr import symbols_of, topological
 from ssmppl.language.checks.rules import RESERVED
 from ssmppl.language.model.trace import Trace
@@ -228,7 +229,10 @@ def _reason(effect: Effect, part: Part, equations: Equations, scales: Scales) ->
             return "it never changes its sign"
     if "second order" in effect.given.values():
         term = equations.second_order(part)
-        return term.reason if isinstance(term, NotApplicable) else ""
+        if isinstance(term, NotApplicable):
+            return term.reason
+        # Beside it no score could be taken, in no parameter that is in it.
+        return "the derivative of its transition jumps" * any(map(jumps, topological([term])))
     return ""
 
 

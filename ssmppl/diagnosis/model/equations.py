@@ -25,7 +25,7 @@ from ssmppl.diagnosis.model.changed_laws import Index, noise_free, scale_of_mean
 from ssmppl.diagnosis.model.forces import Force, force_on
 from ssmppl.errors import NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.calculus import NotDifferentiable, gradient, jumps
+from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     Expr,
@@ -206,8 +206,6 @@ class Equations:
             return NotApplicable(f"its transition has no derivative: {error.found}")
         if total.op == "const":
             return NotApplicable("its transition has no second-order term")
-        if any(map(jumps, topological([total]))):  # no score could be taken beside it
-            return NotApplicable("the derivative of its transition jumps")
         return 0.5 * total
 
     # -- kinematics
