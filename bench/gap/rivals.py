@@ -1,16 +1,19 @@
-"""Three rivals on the same data: what people do today when a simulator does not match.
+"""Four rivals on the same data: what people do today when a simulator does not match.
 
-    python -m bench.gap.rivals [--methods correlation sparse aic] [--half confirm] [--ids t000]
+    python -m bench.gap.rivals [--methods correlation sparse aic loop] [--half confirm] [--ids t000]
 
 `correlation`: the largest correlation of the standardised residuals with the catalogue's terms,
 Bonferroni's p. `sparse`: sparse regression of the smoothed states' residuals on the same terms
 (sequentially thresholded least squares, Brunton, Proctor and Kutz 2016, by pysindy; the threshold
 is chosen on the last 30% of the rows). `aic`: the best AIC over all single refits (Akaike 1974);
 whoever runs it gives the refits: `--refits module:function` names a function of a set's folder that
-returns the base model's log-likelihood and a `Refit` for each (effect, equation).
+returns the base model's log-likelihood and a `Refit` for each (effect, equation). `loop`: the
+effect with the largest correlation is added and the model refitted, again and again while the BIC
+falls (`loop.py`).
 
-All start from the model fitted to the screen and choose parts together, the first 70% of the rows,
-and name effects in the catalogue's words. None of them tells classes, so each candidate is one.
+The first three start from the model fitted to the screen and choose parts together, the first 70%
+of the rows; `loop` fits all of them. All name effects in the catalogue's words. None of them tells
+classes, so each candidate is one.
 """
 
 from __future__ import annotations
@@ -28,9 +31,10 @@ import numpy as np
 
 from bench.gap import arm
 from bench.gap.fits import prepare
+from bench.gap.loop import of_folder
 from bench.gap.plan import CELLS, SPLIT, entries
 from bench.gap.records import Ranked, Record, keep, parse, path_of
-from bench.gap.run import SETS, selected
+from bench.gap.run import SETS, method_digest, selected
 from bench.gap.sealing import digest, file_digest
 from bench.gap.terms import Residuals, Term, library
 
@@ -151,9 +155,11 @@ def recorded(
     log-likelihood, refits) for `aic`.
     """
     folder, here = SETS / id, Path(__file__).parent
+    own = ("loop.py", "disturbances.py") if method == "loop" else ("rivals.py", "terms.py")
     code = digest(
-        file_digest(here / "rivals.py", here / "terms.py").encode(),
+        file_digest(*(here / name for name in own)).encode(),
         file_digest(folder / "data.csv", folder / "model.py").encode(),
+        *([method_digest().encode()] if method == "loop" else []),
     )
     path = path_of(id, method, code)
     if path.exists():
@@ -161,9 +167,12 @@ def recorded(
     began, p, failed = time.perf_counter(), math.nan, ""
     verdict = "no measurable gap"
     ranked: tuple[Ranked, ...] = ()
+    count = 2  # of the ranked ones that are chosen, where an effect is claimed
     try:
         if method == "aic" and refits is not None:
             verdict, ranked = aic(*refits(folder))
+        elif method == "loop":
+            verdict, ranked, count = of_folder(folder)
         else:
             terms = library(prepare(folder))
             if method == "correlation":
@@ -174,7 +183,7 @@ def recorded(
         raise
     except Exception:
         failed = traceback.format_exc()
-    chosen = tuple((r.effect, r.equation) for r in ranked[:2]) if verdict == "effect" else ()
+    chosen = tuple((r.effect, r.equation) for r in ranked[:count]) if verdict == "effect" else ()
     first = ((ranked[0].effect, ranked[0].equation),) if ranked else ()
     record = Record(
         id,
@@ -201,7 +210,7 @@ def named(spec: str) -> Callable:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--methods", nargs="+", default=["correlation", "sparse"],
-                        choices=["correlation", "sparse", "aic"])  # fmt: skip
+                        choices=["correlation", "sparse", "aic", "loop"])  # fmt: skip
     parser.add_argument("--refits", help="module:function, for aic")
     parser.add_argument("--half", choices=list(SPLIT["halves"]))
     parser.add_argument("--cell", choices=CELLS)
