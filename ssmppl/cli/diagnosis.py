@@ -93,7 +93,8 @@ def diagnose(
     """Where MODEL.py differs from DATA, which effect is missing, how far the gap closes.
 
     Prints the four answers in words, and writes a folder with the page index.html, tables
-    (CSV), plots (PNG) and the augmented model. The page is one file that any
+    (CSV), plots (PNG), the augmented model and, where effects are not distinguishable, the inputs
+    of an experiment that would distinguish them (experiment.csv). The page is one file that any
     browser shows, on a phone too. Inputs are columns of the data; several DATA are several
     experiments of one system. Ctrl-C ends early: the stages that are done are kept, and the same
     command resumes from there. Where a part fails, the answer is without it and says so, and the
@@ -135,9 +136,26 @@ def _report_values(report: GapReport) -> dict[str, Any]:
     tables = {name: records(table) for name, table in report.tables().items()}
     return {
         "verdict": report.verdict, "chosen": report.chosen, "estimates": report.estimates,
-        **tables, "missing": tables.get("missing"), "formula": tables.get("formula"),
-        "complete": not len(report.left_out),
+        **tables, "missing": tables.get("missing"), "signals": tables.get("signals"),
+        "formula": tables.get("formula"),
+        "experiment": None if report.experiment is None else records(report.experiment),
+        "separation": _separation(report), "complete": not len(report.left_out),
         "parts": report.parts, "notes": report.notes,
         "settings": report.settings, "mode": report.mode, "seconds": report.seconds,
         "interrupted": report.interrupted,
+    }  # fmt: skip
+
+
+def _separation(report: GapReport) -> dict[str, Any] | None:
+    """The figures of `report.separation`."""
+    found = report.separation
+    if found is None:
+        return None
+    best = found.best and {
+        "signal": found.best.signal.words, "input": found.best.input, "nats": found.best.nats,
+    }  # fmt: skip
+    return {
+        "effects": [{"effect": effect, "equation": equation} for effect, equation in found.effects],
+        "recorded": found.recorded, "needed": found.needed, "best": best, "runs": found.runs,
+        "rows": found.rows, "times_as_many": found.times_as_many,
     }  # fmt: skip

@@ -19,6 +19,8 @@ from ssmppl.analysis.structure import simulators
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
+from ssmppl.diagnosis.experiment.design import MOST_ROWS, separate
+from ssmppl.diagnosis.experiment.rivals import Rival, has_filter
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, proposal_of
 from ssmppl.diagnosis.fitting.bounds import bounds_note
 from ssmppl.diagnosis.fitting.fit import Fit, Fitter
@@ -41,12 +43,10 @@ from ssmppl.diagnosis.run.failures import Failures, reason_of
 from ssmppl.diagnosis.run.seeds import Stage, child_seed
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.effect_selection import (
-    MOST_WORK,
     EffectSelection,
     SelectionResult,
     add_standard_errors,
 )
-from ssmppl.diagnosis.selection.equivalence import best_separating_input
 from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.inference.run.executors import check_executor
@@ -261,8 +261,8 @@ class _Diagnosis:
             return
         with self.failures.guard("whether several effects predict better than fewer"):
             self._validate_on_held_out_rows(r)
-        with self.failures.guard("the input that would separate the class best"):
-            self._separating_input(r)
+        with self.failures.guard("the experiment that would separate the class best"):
+            self._separating_experiment(r)
         with self.failures.guard("how far the gap closes"):
             r.held_out = self._held_out_gain(r)
 
@@ -333,17 +333,30 @@ class _Diagnosis:
             self.horizon,
         ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)  # fmt: skip
 
-    def _separating_input(self, r: Results) -> None:
-        """The input that would separate the class of the best, where there is a class."""
+    def _separating_experiment(self, r: Results) -> None:
+        """How far the members of the first class come apart, where it has several, and in which
+        experiment they would."""
         order, found = r.classes()
         members = [order[i] for i in found.members(1)] if len(order) else []
-        work = sum(e.steps for e in r.screen.experiments) * self.settings.particles
-        if r.chosen is None or len(members) < 2 or not self.trace.inputs:
+        if r.chosen is None or len(members) < 2:
             return
-        if r.base.exact or work <= MOST_WORK:
-            r.separating[1] = best_separating_input(
-                r.screen, members, self._seed(Stage.SEPARATING_INPUT), self.checkpoint
-            )
+        refitted = {refit.index[0]: refit for refit in r.refits if len(refit.index) == 1}
+        rivals = [refitted[k] for k in members if k in refitted and has_filter(refitted[k].fitter)]
+        rivals[1:] = sorted(rivals[1:], key=lambda refit: -refit.score)
+        longest, why = max(e.steps for e in self.experiments), ""
+        if longest > MOST_ROWS:
+            why = f"{longest:,} rows take too long"
+        elif len(rivals) < 2:
+            why = "that takes fits with likelihoods by a Kalman filter, of two of them at least"
+        else:
+            r.separation = separate(
+                self.augmented, self.trace, list(map(Rival.of, rivals)), len(members),
+                self.experiments, self._seed(Stage.EXPERIMENT), self.checkpoint,
+            )  # fmt: skip
+            why = "" if r.separation else "they happen once, or fail under the recorded inputs"
+        if why:
+            names = " and ".join(str(r.screen.design.candidates[k]) for k in members[:2])
+            self.notes.append(f"no experiment was looked for that would distinguish {names}: {why}")
 
     # -- small parts
     def _fit(self, base: Fitter, experiments: Sequence[Experiment]) -> Fit:

@@ -24,6 +24,7 @@ from ssmppl.diagnosis.report.panels import (
     plot,
     ranked_effects,
     residual_map,
+    separating_signal,
 )
 from ssmppl.plots.filters import plot_ancestry, plot_filter
 from ssmppl.plots.likelihood import plot_likelihood
@@ -35,5 +36,5 @@ __all__ = [
     "free_run", "gap_closed", "missing_term", "page", "panel_figures", "pictures", "plot",
     "plot_ancestry", "plot_filter", "plot_forecast", "plot_likelihood", "plot_maximization",
     "plot_predictions", "plot_prior_posterior", "plot_states", "ranked_effects", "residual_map",
-    "save",
+    "save", "separating_signal",
 ]  # fmt: skip

@@ -6,8 +6,11 @@ import dataclasses
 import numpy as np
 import pandas as pd
 
+from ssmppl.diagnosis.experiment.design import ALIKE, BEHIND, OUTSIDE, Separation, Tried
+from ssmppl.diagnosis.experiment.signals import Signal, sine, triangle
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.report.report import GapReport
+from ssmppl.diagnosis.report.tables import signals_table
 
 NAN = float("nan")
 
@@ -255,7 +258,43 @@ def break_of_level():
     )  # fmt: skip
 
 
-ALL = {f.__name__: f for f in (effect_found, none_of_these, no_gap, fast, several, break_of_level)}
+def separation(*nats, recorded=0.8, records=1, **changes):
+    """Two rivals over 400 rows of u, and of w that stays; triangles of u with these ratios, and
+    three signals that have none."""
+    rows = 400
+    before = np.column_stack([2.0 * sine(rows, 23) - 1.0, np.full(rows, 0.5)])
+    tried = [
+        Tried("u", Signal("triangle", f"a triangle of u between −1 and 1 with a period of {40 + k} "
+                          "rows", 2.0 * triangle(rows, 40 + k) - 1.0), value)
+        for k, value in enumerate(nats)
+    ]  # fmt: skip
+    tried += [Tried("u", Signal("constant", f"u held at {k}", np.full(rows, float(k))), NAN, note)
+              for k, note in enumerate((OUTSIDE, ALIKE, BEHIND))]  # fmt: skip
+    found = Separation(
+        (("quadratic drag", "v"), ("state-dependent damping", "v")), 2, recorded, before, records,
+        tuple(tried),
+    )  # fmt: skip
+    if found.runs:
+        inputs = np.column_stack([found.best.signal.values, before[:, 1]])
+        found = dataclasses.replace(found, inputs=inputs)
+    return dataclasses.replace(found, **changes)
+
+
+def with_experiment(found=None):
+    """Rivals that an experiment would tell apart."""
+    found = separation(7.2, 3.1) if found is None else found
+    report, table = effect_found(), None
+    if found.inputs is not None:
+        table = pd.DataFrame(found.inputs, columns=["u", "w"])
+    return dataclasses.replace(
+        report, separation=found, signals=signals_table(found), experiment=table
+    )
+
+
+ALL = {
+    f.__name__: f
+    for f in (effect_found, none_of_these, no_gap, fast, several, break_of_level, with_experiment)
+}
 
 
 def oscillation(steps):

@@ -1,6 +1,7 @@
 """`ssmppl diagnose`: what it hands on, prints and writes. The diagnosis itself is made up here."""
 
 import dataclasses
+import json
 
 import click.testing
 import numpy as np
@@ -12,7 +13,7 @@ from ssmppl import cli
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.errors import DataError
 from tests.cli.shared import SEPARATE
-from tests.diagnosis.made_up import effect_found
+from tests.diagnosis.made_up import effect_found, with_experiment
 
 MODEL = """
 import ssmppl as ssm
@@ -97,6 +98,28 @@ def test_the_words_are_printed_and_the_folder_is_written(calls, tmp_path):
     ((_, _, effects, keywords),) = calls
     assert effects is None
     assert (keywords["mode"], keywords["alpha"], keywords["fixed"]) == ("full", 0.05, None)
+
+
+def test_an_experiment_is_written_and_told_to_programs(calls, monkeypatch, tmp_path):
+    report = dataclasses.replace(
+        with_experiment(), residual_map=tabulate("residual_map"), free_run=tabulate("free_run")
+    )
+    monkeypatch.setattr(ssm, "diagnose", lambda *a, **k: report, raising=False)
+    found = json.loads(run("walk.py", "series.csv", "--json").stdout)
+    assert (tmp_path / "series_report" / "experiment.csv").exists()
+    assert [row["u"] for row in found["experiment"]] == list(report.experiment["u"])
+    assert found["separation"] == {
+        "effects": [{"effect": "quadratic drag", "equation": "v"},
+                    {"effect": "state-dependent damping", "equation": "v"}],
+        "recorded": 0.8, "needed": report.separation.needed, "runs": 1, "rows": 400,
+        "best": {"signal": "a triangle of u between −1 and 1 with a period of 40 rows",
+                 "input": "u", "nats": 7.2},
+        "times_as_many": None,
+    }  # fmt: skip
+    assert found["signals"][1]["nats"] == 7.2
+    monkeypatch.setattr(ssm, "diagnose", lambda *a, **k: light(), raising=False)
+    found = json.loads(run("walk.py", "series.csv", "--json").stdout)
+    assert {found[name] for name in ("experiment", "separation", "signals")} == {None}
 
 
 def test_several_files_are_several_experiments(calls):

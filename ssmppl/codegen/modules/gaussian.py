@@ -152,6 +152,16 @@ class GaussianApproximation:
         value = self._room.follow(theta, y, seen, u, *self._room.arrays)
         return float(value) if value < np.inf else -np.inf
 
+    def extended_increments(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
+    ) -> np.ndarray:
+        """(T,) log p(y_t | y_{1:t-1}, theta) by the extended Kalman filter; -inf where it comes to
+        no number."""
+        if not self.extended_log_likelihood(theta, y, seen, u) > -np.inf:
+            return np.full(len(y), -np.inf)
+        increments: np.ndarray = self._room.arrays[2].copy()
+        return increments
+
     def filtered(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray] | None:

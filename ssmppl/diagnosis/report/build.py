@@ -80,10 +80,15 @@ def build_report(r: Results, seconds: float) -> GapReport:
         causes = table("causes", lambda: tables.causes_table(
             screen, r.refits, found, order, r.tested, r.screen_is_current))  # fmt: skip
         classes = table("classes", lambda: tables.classes_table(
-            screen, found, order, r.separating))  # fmt: skip
+            screen, found, order, r.separation))  # fmt: skip
         if len(causes) and (text or r.unfitted is not None):
             leading = table("leading", lambda: _leading(r, order), leading)
         attributes = table("attributes", lambda: _attributes(r, order, causes, leading), {})
+    signals = experiment = None
+    if (found_apart := r.separation) is not None:
+        with r.failures.guard("the experiment"):
+            signals = tables.signals_table(found_apart)
+            experiment = tables.experiment_table(r.trace, r.experiments, found_apart)
     initial_law = next(
         (x.fitter.initial_law for x in [*r.refits, r.chosen] if x and x.fitter.initial_law), None
     )
@@ -97,6 +102,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
         detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
         free_run=free, not_applicable=_not_applicable(screen), missing=missing,
         formula=formula,
+        signals=signals, experiment=experiment, separation=r.separation,
         model=augmented, model_text=text, chosen=r.names if text else [], estimates=estimates,
         leading=leading, attributes=attributes, parts=_parts(r),
         notes=list(dict.fromkeys(notes)),

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
+from ssmppl.diagnosis.experiment.design import Separation
 from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.diagnosis.verdict.verdicts import VERDICTS
 from ssmppl.errors import ArgumentError, listing
@@ -27,6 +28,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "sign", "estimate", "se",
     ),
     "classes": ("class_id", "effect", "equation", "rho", "separating_input"),
+    "signals": ("signal", "input", "nats", "note"),
     "closed": (
         "effect", "horizon", "rmse_before", "rmse_after", "share", "low", "high",
         "nats_per_sample", "F", "F_low", "F_high", "gain_mean", "gain_noise",
@@ -81,6 +83,9 @@ class Findings:
     not_applicable: pd.DataFrame
     missing: pd.DataFrame | None = None
     formula: pd.DataFrame | None = None
+    signals: pd.DataFrame | None = None
+    experiment: pd.DataFrame | None = None
+    separation: Separation | None = None
     model: Model | None = None
     model_text: str = ""
     chosen: list[str] = field(default_factory=list)
@@ -117,7 +122,7 @@ class Findings:
         -------
         dict of DataFrames
             `where`, `causes`, `classes`, `closed` and the others above, and `left_out`; `missing`
-            and `formula` only if there is one.
+            `formula` and `signals` only if there is one.
         """
         names = [f.name for f in fields(self) if f.name in COLUMNS]
         found = {name: getattr(self, name) for name in [*names, "left_out"]}

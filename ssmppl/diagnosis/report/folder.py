@@ -13,14 +13,16 @@ from ssmppl.errors import ArgumentError
 
 PAGE_FILE = "index.html"
 MODEL_FILE = "augmented_model.py"
+EXPERIMENT_FILE = "experiment.csv"
 TEXT_FILE = "report.txt"
 
 
 def save(report: Findings, folder: str | os.PathLike[str]) -> Path:
     """Write `report` to `folder`, which is made if it is not there; the path of its page.
 
-    Every table as CSV, every panel as PNG, the model file if something was chosen, what `print`
-    shows, and the page. What an earlier report left there and this one does not have is removed.
+    Every table as CSV, every panel as PNG, the model file if something was chosen, the inputs of
+    the experiment to make if there is one, what `print` shows, and the page. What an earlier report
+    left there and this one does not have is removed.
 
     Raises
     ------
@@ -42,6 +44,9 @@ def save(report: Findings, folder: str | os.PathLike[str]) -> Path:
         if report.model_text:
             (target / MODEL_FILE).write_text(report.model_text, encoding="utf-8")
             written.add(MODEL_FILE)
+        if report.experiment is not None:
+            report.experiment.to_csv(target / EXPERIMENT_FILE, index=False)
+            written.add(EXPERIMENT_FILE)
         (target / TEXT_FILE).write_text(f"{report_text(report)}\n", encoding="utf-8")
         (target / PAGE_FILE).write_text(text, encoding="utf-8")
         for name in before - written:
@@ -59,4 +64,5 @@ def _of_a_report(folder: Path) -> set[str]:
     page_file = folder / PAGE_FILE
     if not page_file.is_file() or GENERATOR not in page_file.read_text("utf-8", "replace"):
         return set()
-    return {*(f"{n}.csv" for n in COLUMNS), *(f"{n}.png" for n in TITLES), MODEL_FILE}
+    tables, panels = {f"{n}.csv" for n in COLUMNS}, {f"{n}.png" for n in TITLES}
+    return {*tables, *panels, MODEL_FILE, EXPERIMENT_FILE}

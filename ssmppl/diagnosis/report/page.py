@@ -32,6 +32,7 @@ HEADINGS = {
     "F": "share of the gain", "F_low": "from", "F_high": "to", "t_from": "from t", "t_to": "to t",
     "gain_screen": "gain, score test", "gain_refit": "gain, refitted", "class_id": "class",
     "estimate": "strength", "se": "±", "rho": "correlation", "separating_input": "separating input",
+    "nats": "expected log-likelihood ratio",
     "nats_per_sample": "nats per sample", "gain_mean": "nats, conditional mean",
     "gain_noise": "nats, rest of the distribution", "rmse_before": "error before",
     "rmse_after": "error after", "p": "p", "horizon": "rows ahead", "share": "error reduced by",
@@ -42,6 +43,7 @@ MODELS = {"before": "original model", "after": "augmented model",
 TABLES = {
     "causes": "All effects tried, best first",
     "classes": "Effects not distinguishable by these data",
+    "signals": "Signals that were tried to distinguish them, best first",
     "where": "Where the gap is",
     "closed": "Held-out gain",
     "detection": "Tests of the one-step predictions",
@@ -60,6 +62,8 @@ CAPTIONS = {
     "significant.",
     "free_run": "Open-loop simulation: each model is started once and does not see the data again. "
     "Shaded: 95% prediction interval.",
+    "experiment": "The input of the experiment, held over each row, and the one that was recorded. "
+    "Other inputs, if there are any, stay as they were recorded.",
 }
 
 # One column of text, cards side by side where there is room.
@@ -153,7 +157,7 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
     figures: dict[str, str] = {}
     with report.failures.guard("the page's pictures"):
         figures = _figures(report, pictures(report) if wide is None else wide)
-    first = figures.pop("free_run", "")
+    first, drawn_experiment = figures.pop("free_run", ""), figures.pop("experiment", "")
     opening = _part(report, "the page's first table", lambda: first + _by_horizon(report))
     tables = _part(report, "the page's tables", lambda: _section("Tables", _tables(report)))
     parts = [
@@ -166,6 +170,7 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
         f'<section class="first">{opening}</section>' if opening else "",
         _answers(report),
         _section("How sure", _list(words.how_sure(report)) + _unknown(report)),
+        _section("What would decide", _experiment(report, drawn_experiment)),
         _section("Next steps", _list(words.next_steps(report))),
         _section("The evidence", "\n".join(figures.values())),
         tables,
@@ -250,6 +255,15 @@ def _unknown(report: Findings) -> str:
     return out
 
 
+def _experiment(report: Findings, picture: str) -> str:
+    """What would tell the rivals apart, with its inputs to take away."""
+    sentences = "".join(f"<p>{_text(s)}</p>\n" for s in words.to_decide(report))
+    if report.experiment is None:
+        return sentences
+    csv = report.experiment.to_csv(index=False)
+    return f"{sentences}{picture}\n{_download('experiment.csv', 'text/csv', csv)}"
+
+
 # -- the pictures
 def _figures(report: Findings, wide: dict[str, bytes]) -> dict[str, str]:
     """Each panel with its title and what it shows."""
@@ -300,6 +314,9 @@ def _alt(report: Findings, name: str) -> str:
     if name == "missing_term":
         items = [f"missing term in {e} over {v}" for e, v in curves(report)]
         return f"Curves with bands: {words.listed(items)}."
+    if name == "experiment":
+        best = report.separation.best if report.separation else None
+        return f"Course of the input: {best.signal.words if best else ''}."
     shown = words.listed(list(dict.fromkeys(str(c) for _, c in runs(report))))
     first = (words.rows(report.closed) or [{}])[0]
     text = f"Data of {shown} with free runs of the original and the augmented model."
@@ -323,7 +340,9 @@ def _tables(report: Findings) -> str:
     out = []
     letters = words.class_letters(report)
     for name, title in TABLES.items():
-        table = report.tables()[name]
+        table = report.tables().get(name)
+        if table is None:
+            continue
         if name == "classes":
             table = table[table["class_id"].isin(list(letters))]
         if not len(table):
@@ -403,14 +422,18 @@ def _glossary() -> str:
 def _model(report: Findings) -> str:
     if not report.model_text:
         return ""
-    coded = base64.b64encode(report.model_text.encode()).decode("ascii")
-    link = f'<p><a download="augmented_model.py" href="data:text/x-python;base64,{coded}">' \
-           "Download augmented_model.py</a></p>"  # fmt: skip
+    link = _download("augmented_model.py", "text/x-python", report.model_text)
     return _section(
         "Augmented model",
         f'{link}\n<div class="scroll" tabindex="0" role="region" aria-label="Model file">'
         f"<pre><code>{html.escape(report.model_text)}</code></pre></div>",
     )
+
+
+def _download(name: str, kind: str, content: str) -> str:
+    """A link that saves a file whose content is in the page."""
+    coded = base64.b64encode(content.encode()).decode("ascii")
+    return f'<p><a download="{name}" href="data:{kind};base64,{coded}">Download {name}</a></p>'
 
 
 def _colophon(report: Findings) -> str:

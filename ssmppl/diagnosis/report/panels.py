@@ -27,6 +27,7 @@ TITLES = {
     "gap_closed": "Share of the reference model's held-out gain",
     "missing_term": "Estimated missing term",
     "free_run": "Open-loop (free-run) simulation",
+    "experiment": "The experiment that would tell them apart",
 }
 
 MOST_EQUATIONS, MOST_EFFECTS, MOST_CURVES, MOST_RUNS = 12, 8, 4, 6  # that are drawn
@@ -35,6 +36,7 @@ LONGEST_NAME = 52  # characters above a bar
 WIDE = 6.0  # inches, from which curves stand side by side
 DESK = 7.4  # inches: what a column of text is wide
 DPI = 170
+MOST_TURNS = 60  # of a signal that are drawn
 OPAQUE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 SHARES = (-1.0, 2.0)  # what is shown of F at most
 
@@ -291,6 +293,43 @@ def free_run(
     return ax
 
 
+def _drawn_rows(values: np.ndarray) -> int:
+    """How many rows of a signal (T,) are drawn: as many as it takes to turn round `MOST_TURNS`
+    times."""
+    steps = np.diff(values)
+    moving = np.flatnonzero(steps)
+    turns = moving[1:][np.diff(np.sign(steps[moving])) != 0.0]
+    return len(values) if len(turns) <= MOST_TURNS else int(turns[MOST_TURNS]) + 1
+
+
+def separating_signal(report: Findings, ax: Any) -> Any:
+    """The signal that would tell the rivals apart, and the recorded one, held over each row.
+
+    Raises
+    ------
+    ArgumentError : the report has no experiment.
+    """
+    found = report.separation
+    if found is None or found.inputs is None or report.experiment is None:
+        raise ArgumentError(
+            "the report has no experiment to draw",
+            fix="look at report.separation, which says why",
+        )
+    table = report.experiment
+    varied = int(np.argmax(np.any(found.inputs != found.recorded_inputs, axis=0)))
+    now, before = found.inputs[:, varied], found.recorded_inputs[:, varied]
+    rows = _drawn_rows(now)
+    x = times(ax, table["time"] if "time" in table else np.arange(1, found.rows + 1))[:rows]
+    ax.step(x, before[:rows], where="post", color=FAINT, linewidth=0.8, label="recorded")
+    ax.step(x, now[:rows], where="post", color=AFTER, linewidth=1.4, label="experiment")
+    ax.set_title(f"first {rows:,} of {found.rows:,} rows" if rows < found.rows else "")
+    ax.margins(x=0.01)
+    ax.set_xlabel("t")
+    ax.set_ylabel(found.best.input if found.best else "")
+    bare(ax)
+    return ax
+
+
 def plot(report: Findings) -> Any:
     """All panels that the report has something for, below each other, as a pyplot figure."""
     from matplotlib import pyplot
@@ -339,6 +378,13 @@ def pictures(report: Findings, width: float = DESK) -> dict[str, bytes]:
     return found
 
 
+def _legend(figure: Any, ax: Any) -> None:
+    """The legend of the axes, below the figure."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=3, frameon=False,
+                  handlelength=1.6, columnspacing=1.2, borderaxespad=0.2)  # fmt: skip
+
+
 def _height(report: Findings, name: str, width: float) -> float:
     """Height in inches; 0 where there is nothing to draw."""
     if name == "residual_map":
@@ -351,6 +397,8 @@ def _height(report: Findings, name: str, width: float) -> float:
     if name == "missing_term":
         lines, _ = _grid(len(curves(report)[:MOST_CURVES]), width)
         return 2.4 * lines
+    if name == "experiment":
+        return 2.3 if report.experiment is not None and report.separation is not None else 0.0
     count = len(runs(report)[:MOST_RUNS])
     return 0.5 + 2.0 * count if count else 0.0
 
@@ -375,13 +423,14 @@ def _draw(report: Findings, name: str, figure: Any, width: float) -> None:
             free_run(report, ax, experiment, channel)
             if ax is not axes[-1]:
                 ax.set_xlabel("")
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower left", ncols=3, frameon=False,
-                      handlelength=1.6, columnspacing=1.2, borderaxespad=0.2)  # fmt: skip
+        _legend(figure, axes[0])
     else:
         panel = {
             "residual_map": residual_map,
             "ranked_effects": ranked_effects,
             "gap_closed": gap_closed,
+            "experiment": separating_signal,
         }[name]
-        panel(report, figure.subplots())
+        ax = panel(report, figure.subplots())
+        if name == "experiment":
+            _legend(figure, ax)

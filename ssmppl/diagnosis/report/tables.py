@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.data.channels import column_names
+from ssmppl.data.time_steps import lengths
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, starts_of
+from ssmppl.diagnosis.experiment.design import Separation
 from ssmppl.diagnosis.heldout.predictions import FreeRun
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.screening.location import BasisGroupScore, curve, localise, regions, when
@@ -17,11 +20,13 @@ from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.equivalence import Classes
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.drawing.numerals import label
+from ssmppl.language.model.trace import Trace
 
 if TYPE_CHECKING:
     import pandas as pd
 
 CURVE_POINTS = 41
+FIRST = 1  # number of the class of the best
 AT_BOUND = 1e-3  # standard errors of the screen, below which a one-sided strength is none
 STANDS_OUT = 3.0  # |z| of a region that is named
 # Of the error rate, for the places and for the checks of the predictions: with the whole of it for
@@ -223,10 +228,13 @@ def _when(c: Candidate, shape: str, value: float, times: Sequence[Any]) -> str:
 
 
 def classes_table(
-    screen: Screen, found: Classes, order: Sequence[int], separating: dict[int, str]
+    screen: Screen, found: Classes, order: Sequence[int], separation: Separation | None
 ) -> pd.DataFrame:
-    """The members of each class, the leader first; an effect that is a class by itself, too."""
-    rows = []
+    """The members of each class, the leader first; an effect that is a class by itself, too.
+
+    separation : of the first class, None where it was not looked for.
+    """
+    rows, best = [], separation.best if separation and separation.runs else None
     for number in dict.fromkeys(found.class_id.tolist()):
         members = found.members(number)
         for m in members:
@@ -234,9 +242,41 @@ def classes_table(
             rows.append({
                 "class_id": int(number), "effect": c.effect.name, "equation": c.equation,
                 "rho": float(found.rho[m]),
-                "separating_input": separating.get(int(number), "") if len(members) > 1 else "",
+                "separating_input": best.signal.words if best and number == FIRST else "",
             })  # fmt: skip
     return tabulate("classes", rows)
+
+
+def signals_table(separation: Separation) -> pd.DataFrame | None:
+    """The signals that were tried, best first, behind the recorded inputs; None where no other was
+    needed, or there was nothing to vary."""
+    if not separation.tried:
+        return None
+    rows = [{"signal": "as recorded", "input": "", "nats": separation.recorded, "note": ""}]
+    rows += [{"signal": t.signal.words, "input": t.input, "nats": t.nats, "note": t.note}
+             for t in separation.tried]  # fmt: skip
+    return tabulate("signals", rows)
+
+
+def experiment_table(
+    trace: Trace, experiments: Sequence[Experiment], separation: Separation
+) -> pd.DataFrame | None:
+    """The inputs of the best experiment under the names that data sets have, with the labels of the
+    longest record; None where there is no such experiment."""
+    import pandas as pd
+
+    if separation.inputs is None:
+        return None
+    longest = max(experiments, key=lambda e: e.steps)
+    step, columns = "", {} if longest.time is None else {"time": longest.time}
+    if trace.time_step is not None and longest.time is not None:
+        name, unit = trace.time_step
+        step = name * np.array_equal(lengths(longest.time, unit), longest.inputs[name][:-1])
+    for k, symbol in enumerate(trace.input_symbols):
+        _, name, index = symbol.data
+        if name != step:  # it follows from the labels
+            columns[column_names(name, index)[0] if index else name] = separation.inputs[:, k]
+    return pd.DataFrame(columns)
 
 
 def map_table(screen: Screen) -> pd.DataFrame:

@@ -78,10 +78,11 @@ def _table(cells: list[tuple[str, ...]]) -> list[str]:
 
 
 def report_text(report: Findings) -> str:
-    """The verdict, the four answers, one table, what is undecided and what would decide it."""
+    """The verdict, the answers, one table, what is undecided and what would decide it."""
     lines = [*wrapped(words.headline(report)), ""]
     for name, sentences in words.sections(report):
-        lines += wrapped(" ".join(sentences), f"{name:<10}", " " * 10)
+        if sentences:
+            lines += wrapped(" ".join(sentences), f"{name:<11}", " " * 11)
     cells = cause_rows(report)
     if len(cells) > 1:
         lines += ["", *_table(cells)]

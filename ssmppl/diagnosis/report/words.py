@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from ssmppl.diagnosis.experiment.design import ALIKE, OUTSIDE, SURE, Separation
 from ssmppl.diagnosis.heldout.simulation import WINDOWED
 from ssmppl.diagnosis.verdict.verdicts import CURVES, EFFECT, NO_GAP, NONE_OF_THESE
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
@@ -37,6 +38,9 @@ GLOSSARY = {
     "probability, if the model were right, that any effect tried is this significant; of places "
     "and of tests of the predictions five times their own. So alpha bounds the chance that an "
     "effect is named falsely, and about 1.4 alpha (fast mode: 1.6 alpha) that of any false finding",
+    "expected log-likelihood ratio": "the mean over records like this one of how much more likely "
+    "the right effect makes them than the wrong one fitted to them; with 5.4 nats the right one is "
+    "ahead in 95% of records",
     "z": "a standardised deviation from what the model expects",
     "±": "one standard error; twice that, either way, is about a 95% interval",
 }
@@ -215,10 +219,11 @@ def significant_rows(report: Findings, table: Any) -> list[dict[str, Any]]:
 
 # -- the answers
 def sections(report: Findings) -> list[tuple[str, list[str]]]:
-    """The title and the sentences of each section: where, which, how far, how sure."""
+    """The title and the sentences of each section: where, which, how far, how sure, and what would
+    decide."""
     return [
         ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
-        ("How sure", how_sure(report)),
+        ("How sure", how_sure(report)), ("To decide", to_decide(report)),
     ]  # fmt: skip
 
 
@@ -497,6 +502,76 @@ def how_sure(report: Findings) -> list[str]:
     return out
 
 
+def to_decide(report: Findings) -> list[str]:
+    """What would tell the rivals of the first class apart: an experiment, or more rows."""
+    found = report.separation
+    if found is None:
+        return []
+    names = [label(*e) for e in found.effects]
+    pair = (
+        "between the two" if len(names) == 2 else "between the two that are hardest to tell apart"
+    )
+    needed, recorded = number(found.needed, 2), number(found.recorded, 2)
+    out = [f"These records do not tell {listed(names, 'from')}."]
+    if len(names) > 2:
+        first = f" (the first {len(names)} of {found.members})" * (found.members > len(names))
+        out = [f"These records do not tell {listed(names)} apart{first}."]
+    if found.as_recorded:
+        return [*out, f"Another {found.rows:,} rows {_recorded_kind(found)} are expected to "
+                f"(expected log-likelihood ratio {recorded} nats {pair}, {needed} are enough): no "
+                "other experiment is needed."]  # fmt: skip
+    if found.best is not None and found.runs:
+        again, each = "", ""
+        if found.runs > 1:
+            again, each = f", run {found.runs} times", " in each run"
+        return [
+            *out,
+            sentence(f"{found.best.signal.words} would{again} (expected log-likelihood ratio "
+                     f"{number(found.best.nats, 2)} nats {pair}{each}, {needed} are enough; with "
+                     f"the recorded inputs: {recorded}): experiment.csv"),
+            f"It keeps {found.best.input} within its recorded range and, by the models, what is "
+            "observed near its own.",
+            f"Without it, it would take {_more_rows(found)}.",
+        ]  # fmt: skip
+    if found.tried:
+        return [*out, *_none_separates(found, pair), f"It would take {_more_rows(found)}."]
+    return [*out, f"There is no input to vary: it would take {_more_rows(found)} (expected "
+            f"log-likelihood ratio of these: {recorded} nats {pair}; {needed} are "
+            "needed)."]  # fmt: skip
+
+
+def _none_separates(found: Separation, pair: str) -> list[str]:
+    """That no signal would do, with the best figure, and why most have none."""
+    inputs = listed(list(dict.fromkeys(t.input for t in found.tried)))
+    text = f"none of the {len(found.tried)} signals of {inputs} that were tried would"
+    if found.best is not None and found.best.nats >= SURE:
+        text += f"; the best, {found.best.signal.words}, has an expected log-likelihood ratio of " \
+                f"{number(found.best.nats, 2)} nats {pair}, and {number(found.needed, 2)} are " \
+                f"needed (with the recorded inputs: {number(found.recorded, 2)})"  # fmt: skip
+    reasons = {ALIKE: "the models, as they are fitted, predict nearly the same",
+               OUTSIDE: "what is observed leaves its recorded range"}  # fmt: skip
+    counts = {note: sum(t.note == note for t in found.tried) for note in reasons}
+    why = [f"under {counts[note]} of them {reasons[note]}" for note in reasons if counts[note]]
+    out = [sentence(text), *([sentence(listed(why))] if why else [])]
+    if 2 * counts[ALIKE] > len(found.tried):
+        out.append("In the recorded range it makes little difference which of them is used.")
+    return out
+
+
+def _recorded_kind(found: Separation) -> str:
+    return "with the recorded inputs" if found.recorded_inputs.shape[1] else "of this kind"
+
+
+def _more_rows(found: Separation) -> str:
+    """How many rows would do without another experiment."""
+    kind, times = _recorded_kind(found), found.times_as_many
+    whole = f"the {found.rows:,} of {'this' if found.records == 1 else 'the longest'} record"
+    if math.isinf(times):
+        return f"more than {number(found.needed / SURE, 1)} times as many rows {kind} as {whole}"
+    return f"about {number(times * found.rows, 2)} rows {kind}, {number(times, 2)} times as many " \
+           f"as {whole}"  # fmt: skip
+
+
 def undecided(report: Findings) -> list[str]:
     """What these data could not decide, and the parts that do not apply, with their reasons."""
     out = []
@@ -518,6 +593,22 @@ def left_out(report: Findings) -> list[str]:
     return [sentence(f"{r['part']}: {r['reason']}") for r in rows(report.left_out)]
 
 
+def _to_distinguish(report: Findings, row: dict[str, Any]) -> list[str]:
+    """What to record, or else to do, to tell a cause from its rivals; nothing in fast mode, whose
+    classes are preliminary."""
+    if report.mode == "fast":
+        return []
+    found, names = report.separation, listed(alternatives(report, row), "from")
+    looked_for = found is not None and (row["effect"], row.get("equation")) in found.effects
+    if found is not None and looked_for and found.as_recorded:
+        return [f"To distinguish {names}, record as much again, and diagnose all of it together."]
+    if report.experiment is not None and looked_for:
+        return [f"To distinguish {names}, run experiment.csv (report.experiment in Python) on "
+                "the system, record what it does, and diagnose all records together."]  # fmt: skip
+    return [f"To distinguish {names}, add a sensor, inspect the system, or record it under other "
+            "conditions."]  # fmt: skip
+
+
 def next_steps(report: Findings) -> list[str]:
     """What to do now: what to measure, and what to do with the model."""
     out = []
@@ -536,15 +627,7 @@ def next_steps(report: Findings) -> list[str]:
         others = rivals(report, row)
         if not others:
             continue
-        inputs = [r["separating_input"] for r in others]
-        inputs = list(dict.fromkeys(i for i in inputs if isinstance(i, str) and i))
-        if inputs:
-            out.append(f"To distinguish {listed(alternatives(report, row), 'from')}, record data "
-                       f"with {listed(inputs, 'or')}.")  # fmt: skip
-        else:
-            out.append(f"None of the simple inputs considered would distinguish "
-                       f"{listed(alternatives(report, row), 'from')}; add a sensor, or inspect the "
-                       "system.")  # fmt: skip
+        out += _to_distinguish(report, row)
     if report.verdict == NONE_OF_THESE and report.missing is not None:
         out.append("Look at the estimated curve, consider which physical effect has this shape, "
                    "write it as an @ssm.effect and run again with it.")  # fmt: skip

@@ -16,7 +16,7 @@ class Stage(IntEnum):
     FIT = 1
     SCREEN = 2
     SELECTION = 4
-    SEPARATING_INPUT = 7
+    EXPERIMENT = 7  # that separates a class
     HELD_OUT = 8
     STATES = 11  # at the fit, for the scales
     TIMING = 12

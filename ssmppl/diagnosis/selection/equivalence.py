@@ -1,4 +1,4 @@
-"""Equivalence classes of candidates that these data do not separate, and the input that would.
+"""Equivalence classes of candidates that these data do not separate.
 
 The class of the best is its confidence set: the refits that lie no further behind than the truth
 would by chance; those of its kind that lose no more to it than a formula that is only about right
@@ -15,29 +15,18 @@ g = 1.645^2 / (1 - |rho|) = 2.7 / (1 - |rho|).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.data import Experiment
-from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.screening.efficient_score import Null, efficient
-from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
+from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.refit import Refit
-from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.inference.run.seeds import random_state
 
 SEPARATING = 2.7  # 1.645^2: times 1 / (1 - |rho|), the gain that separates two effects at 5%
 LEAST_CUT = 2.0  # nats behind the best that any member of a confidence set may be
 FORM = 0.1  # likewise, as a share of what the best gains: no formula is the machine's own
 DRAWS = 4000  # of the scores, for the cuts
-
-# Inputs under which a class might separate.
-SETS = 25  # simulated under each input
-MOST_VARIED = 4  # inputs that are replaced in turn
-SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one in rows, stairs
 
 
 def similarity(rho: np.ndarray, sided: np.ndarray | None = None) -> np.ndarray:
@@ -208,150 +197,3 @@ def _of_the_best(
     alike = ~distinguishable(gains[0], similarity(rho, sided)[0]) & strong
     out[refitted:] = alike[refitted:]
     return out
-
-
-# --- the input that would separate ---------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Separation:
-    """The input that separates a class best. separable : whether it would, at 5%.
-
-    nats : by input, the least gain (1 - |rho|) over pairs of the class, of which 2.7 is enough.
-    """
-
-    input: str
-    separable: bool
-    nats: dict[str, float]
-
-
-def separating_input(
-    members: Sequence[int],
-    strengths: np.ndarray,
-    covariances: Mapping[str, np.ndarray],
-    sided: np.ndarray | None = None,
-) -> Separation:
-    """The input that separates the members of a class best, the hardest pair counting.
-
-    Parameters
-    ----------
-    members : columns of the class, at least two.
-    strengths : (K,) estimated strength of each, which gains strength^2 V_kk / 2 if it is the truth.
-    covariances : by input, V (K, K) of the efficient scores under that input.
-
-    Raises
-    ------
-    ArgumentError : fewer than two members, or no input.
-    """
-    which = np.asarray(members, int)
-    if len(which) < 2 or not covariances:
-        raise ArgumentError(
-            f"{len(which)} members and {len(covariances)} inputs to separate them",
-            fix="give the columns of a class of two or more, and V under each input",
-        )
-    signs = None if sided is None else np.asarray(sided)[which]
-    nats = {}
-    for name, covariance in covariances.items():
-        v = np.asarray(covariance, float)[np.ix_(which, which)]
-        size = np.sqrt(np.maximum(np.diagonal(v), 0.0))
-        rho = np.divide(
-            v, np.outer(size, size), out=np.ones_like(v), where=np.outer(size, size) > 0
-        )
-        gain = 0.5 * np.asarray(strengths, float)[which] ** 2 * np.diagonal(v)
-        separation = gain[:, None] * (1.0 - np.minimum(similarity(rho, signs), 1.0))
-        nats[name] = float(np.min(separation[~np.eye(len(which), dtype=bool)]))
-    best = max(nats, key=lambda name: nats[name])
-    return Separation(best, nats[best] >= SEPARATING, nats)
-
-
-def best_separating_input(
-    screen: Screen, members: Sequence[int], seed: np.random.SeedSequence, checkpoint: Checkpoint
-) -> str:
-    """The simple input that would separate these candidates best; "" if none would.
-
-    The base model is simulated under each, and its scores say how alike the candidates would be.
-    """
-    design, columns = screen.design, np.array(members, dtype=int)
-    inputs = simple_inputs(screen.experiments, list(map(repr, design.trace.input_symbols)))
-    if not inputs:
-        return ""
-    whole = design.theta(screen.theta)
-    names = list(inputs)
-    one = partial(_scores_under_input, design, list(inputs.values()), whole, columns, seed)
-    results = checkpoint.map("trying inputs", SETS * len(names), one)
-    covariances = {}
-    for which, name in enumerate(names):
-        own = results[which :: len(names)]
-        done = [
-            r for r in own if not checkpoint.failures.record_task(f"a set under {name}", r) and r
-        ]
-        if not done:
-            continue
-        law = Null.of(
-            np.stack([r["columns"] for r in done]), np.stack([r["nuisance"] for r in done]),
-            quadratic=design.quadratic[columns], sided=design.sided[columns],
-        )  # fmt: skip
-        try:
-            nothing = np.zeros(len(columns)), np.zeros(law.nuisance.shape[1])
-            covariances[name] = efficient(law, *nothing).covariance
-        except ArgumentError:  # too few sets for so many parameters
-            continue
-    if not covariances:
-        return ""
-    best = separating_input(
-        range(len(columns)), screen.efficient.strength[columns], covariances,
-        screen.efficient.sided[columns],
-    )  # fmt: skip
-    return best.input if best.separable else ""
-
-
-def _scores_under_input(
-    design: ScreenDesign, inputs: Sequence[Sequence[Experiment]], theta: np.ndarray,
-    columns: np.ndarray, seed: np.random.SeedSequence, k: int,
-) -> Numbers:  # fmt: skip
-    """The scores of a set that is simulated under one of the inputs; empty where there are none."""
-    number, which = divmod(k, len(inputs))
-    stream = random_state(seed, which, number)
-    own = theta[: len(design.columns.base.parameter_symbols)]
-    try:
-        data = design.simulator.sets(inputs[which], own, stream)
-        passes = design.smoother.run(data, theta, stream, predicted=False)
-    except SamplingError:
-        return {}
-    if not all(np.all(np.isfinite(p.rows)) for p in passes):
-        return {}
-    found = design.statistics(data, passes, stream, checks=False)
-    return {"columns": found.candidate_scores[columns], "nuisance": found.nuisance}
-
-
-def simple_inputs(
-    experiments: Sequence[Experiment], names: Sequence[str]
-) -> dict[str, list[Experiment]]:
-    """The experiments with one of the inputs (L,) replaced at a time, in the units of its own.
-
-    What does not vary in an experiment is no drive (the length of a step, a setting), and stays.
-    """
-    ends = [(e.u.min(axis=0), e.u.max(axis=0)) for e in experiments]
-    varies = np.array([low < high for low, high in ends])
-    out: dict[str, list[Experiment]] = {}
-    for k in np.flatnonzero(varies.any(axis=0))[:MOST_VARIED].tolist():
-        for e, varied in zip(experiments, varies[:, k], strict=True):
-            for name, column in _others(e.u[:, k], names[k]).items():
-                u = e.u.copy()
-                u[:, k] = column if varied else e.u[:, k]
-                out.setdefault(name, []).append(replace(e, u=u))
-    return out
-
-
-def _others(u: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    """Other courses of an input u (T,), by what they are called."""
-    t = np.arange(len(u))
-    low, high, mean, size = u.min(), u.max(), u.mean(), np.sqrt(2.0) * u.std()
-    stair = np.minimum(t * LEVELS // len(u), LEVELS - 1) / (LEVELS - 1.0)
-    return {
-        f"the same {name} at twice the size": 2.0 * u,
-        f"the same {name} at half the size": 0.5 * u,
-        f"a slow sine of {name}": mean + size * np.sin(2.0 * np.pi * t / (SLOW * len(u))),
-        f"a fast sine of {name}": mean + size * np.sin(2.0 * np.pi * t / FAST),
-        f"a staircase of {name} over the same range": low + (high - low) * stair,
-    }

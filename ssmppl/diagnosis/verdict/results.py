@@ -8,6 +8,7 @@ from typing import Any
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.experiment.design import Separation
 from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain
 from ssmppl.diagnosis.heldout.row_split import RowSplit
@@ -24,8 +25,8 @@ from ssmppl.language.model.trace import Trace
 class Results:
     """The results of the stages so far. selection, held_out : None where not done.
 
-    blocks : left out in turn, 0 for three parts. separating : by class, the input that would
-    separate it.
+    blocks : left out in turn, 0 for three parts. separation : of the first class, None where it was
+    not looked for.
     """
 
     trace: Trace
@@ -41,7 +42,7 @@ class Results:
     selection: SelectionResult | None = None
     held_out: HeldOutGain | None = None
     blocks: int = 0
-    separating: dict[int, str] = field(default_factory=dict)
+    separation: Separation | None = None
     interrupted: bool = False
     failures: Failures = field(default_factory=Failures)
 

@@ -22,7 +22,16 @@ from ssmppl.diagnosis.report.panels import TITLES
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.report.text import AHEAD
 from ssmppl.errors import ArgumentError
-from tests.diagnosis.made_up import ALL, MODEL_TEXT, effect_found, fast, no_gap, several
+from tests.diagnosis.made_up import (
+    ALL,
+    MODEL_TEXT,
+    effect_found,
+    fast,
+    no_gap,
+    separation,
+    several,
+    with_experiment,
+)
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 VOID = {"meta", "img", "source", "br", "hr", "link", "input"}
@@ -145,6 +154,36 @@ def test_the_model_file_can_be_taken_off_the_page():
     assert not Reader(page("no_gap")).all("a")
 
 
+def test_an_experiment_stands_behind_how_sure_with_its_picture_and_its_file():
+    report = with_experiment()
+    text = page("with_experiment")
+    reader = Reader(text)
+    assert reader.faults == []
+    order = [text.index(words) for words in (
+        ">How sure<", ">What would decide<", "These records do not tell", "triangle of u",
+        TITLES["experiment"], "Download experiment.csv", ">Next steps<", ">The evidence<",
+    )]  # fmt: skip
+    assert order == sorted(order)
+    link, _ = reader.all("a", download="experiment.csv")[0]
+    back = pd.read_csv(io.BytesIO(base64.b64decode(link["href"].partition(",")[2])))
+    pd.testing.assert_frame_equal(back, report.experiment)
+    spoken = [attrs["alt"].replace("\N{NO-BREAK SPACE}", " ") for attrs, _ in reader.all("img")]
+    assert "Course of the input: a triangle of u between −1 and 1 with a period of 40 rows." in (
+        spoken
+    )
+    cells = [cell for _, cell in reader.all("td")]
+    assert cells[cells.index("as recorded") + 2] == "0.8"
+    assert "leaves the recorded range" in cells
+
+
+def test_without_an_experiment_its_words_alone_stand_there():
+    text = plots.page(with_experiment(separation(0.4)))
+    assert "None of the 4 signals" in text
+    assert TITLES["experiment"] not in text
+    assert "experiment.csv" not in text
+    assert "What would decide" not in page("effect_found")
+
+
 def test_tables_scroll_in_their_boxes_and_hold_the_numbers():
     reader = Reader(page("effect_found"))
     for tag, _, path, _ in reader.elements:
@@ -188,7 +227,10 @@ def test_vectors_among_the_parameters_take_a_line_each():
 def test_an_empty_report_has_a_page(verdict):
     reader = Reader(
         plots.page(
-            GapReport(verdict, **{name: tabulate(name) for name in COLUMNS if name != "left_out"})
+            GapReport(
+                verdict,
+                **{name: tabulate(name) for name in COLUMNS if name not in ("left_out", "signals")},
+            )
         )
     )
     assert reader.faults == []
@@ -207,6 +249,7 @@ def test_saving_writes_tables_plots_model_words_and_page(tmp_path):
         numbers = table.select_dtypes("number")
         np.testing.assert_allclose(back[numbers.columns].astype(float), numbers, rtol=1e-12)
         assert len(back) == len(table)
+    assert not (folder / "experiment.csv").exists()
     assert (folder / "augmented_model.py").read_text(encoding="utf-8") == MODEL_TEXT
     assert (folder / "report.txt").read_text(encoding="utf-8") == f"{report}\n"
     pngs = {p.stem for p in folder.glob("*.png")}
@@ -225,6 +268,21 @@ def test_a_later_report_leaves_nothing_of_an_earlier_one_and_foreign_files_alone
     assert not (tmp_path / "augmented_model.py").exists()
     assert not (tmp_path / "missing.csv").exists()
     assert (tmp_path / "data.csv").read_text(encoding="utf-8") == "mine"
+
+
+def test_an_experiment_is_a_file_until_a_later_report_has_none(tmp_path):
+    light = {"residual_map": tabulate("residual_map"), "free_run": tabulate("free_run")}
+    report = dataclasses.replace(with_experiment(), **light)
+    report.save(tmp_path)
+    report.save(tmp_path)  # over what it wrote itself
+    back = pd.read_csv(tmp_path / "experiment.csv")
+    pd.testing.assert_frame_equal(back, report.experiment, check_exact=True)
+    signals = pd.read_csv(tmp_path / "signals.csv")
+    np.testing.assert_allclose(signals["nats"][:3], [0.8, 7.2, 3.1])
+    assert (tmp_path / "experiment.png").exists()
+    dataclasses.replace(no_gap(), **light).save(tmp_path)
+    left = {p.name for p in tmp_path.iterdir()}
+    assert not left & {"experiment.csv", "signals.csv", "experiment.png"}
 
 
 def test_a_folder_that_cannot_be_made_is_an_error_with_its_name(tmp_path):

@@ -27,7 +27,9 @@ from tests.diagnosis.made_up import (
     fast,
     no_gap,
     none_of_these,
+    separation,
     several,
+    with_experiment,
 )
 
 mpl.use("Agg")
@@ -248,8 +250,55 @@ def test_all_text_fits_on_a_phone(name, monkeypatch):
         assert unreadable(figure, monkeypatch) == []
 
 
+# -- the experiment
+def test_the_experiment_is_drawn_over_the_recorded_input(ax):
+    report = with_experiment()
+    plots.separating_signal(report, ax)
+    found = lines(ax)
+    np.testing.assert_array_equal(found["experiment"].get_ydata(), report.experiment["u"])
+    recorded = report.separation.recorded_inputs[:, 0]
+    np.testing.assert_array_equal(found["recorded"].get_ydata(), recorded)
+    np.testing.assert_array_equal(found["experiment"].get_xdata(), np.arange(1, 401))
+    assert found["experiment"].get_drawstyle() == "steps-post"
+    assert ax.get_ylabel() == "u"
+    assert ax.get_title() == ""
+
+
+def test_the_input_that_is_varied_is_drawn_by_the_labels_of_its_rows(ax):
+    """The second of two, whose other stays."""
+    report = with_experiment()
+    found = report.separation
+    swapped = dataclasses.replace(
+        found, inputs=found.inputs[:, ::-1], recorded_inputs=found.recorded_inputs[:, ::-1]
+    )
+    table = report.experiment.assign(time=0.5 * np.arange(400))
+    plots.separating_signal(dataclasses.replace(report, separation=swapped, experiment=table), ax)
+    np.testing.assert_array_equal(lines(ax)["experiment"].get_ydata(), report.experiment["u"])
+    assert lines(ax)["experiment"].get_xdata()[-1] == 199.5
+
+
+def test_of_a_fast_signal_the_first_turns_are_drawn(ax):
+    report = with_experiment()
+    fast_one = np.arange(400) % 2 - 0.5
+    found = dataclasses.replace(
+        report.separation,
+        inputs=np.column_stack([fast_one, report.separation.inputs[:, 1]]),
+    )
+    plots.separating_signal(dataclasses.replace(report, separation=found), ax)
+    rows = len(lines(ax)["experiment"].get_ydata())
+    assert 55 < rows < 65
+    assert ax.get_title() == f"first {rows} of 400 rows"
+
+
+def test_without_an_experiment_there_is_nothing_to_draw(ax):
+    for report in (effect_found(), with_experiment(separation(0.4))):
+        with pytest.raises(ArgumentError, match=r"no experiment[\s\S]*report\.separation"):
+            plots.separating_signal(report, ax)
+        assert "experiment" not in plots.pictures(report)
+
+
 def test_one_figure_of_all_panels(monkeypatch):
-    figure = effect_found().plot()
+    figure = with_experiment().plot()
     try:
         titles = [part.get_suptitle() for part in figure.subfigs]
         assert titles == list(TITLES.values())

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmppl.diagnosis.experiment.design import ALIKE
 from ssmppl.diagnosis.report.findings import COLUMNS, MODES, tabulate
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.report.words import (
@@ -23,6 +24,7 @@ from ssmppl.diagnosis.report.words import (
     next_steps,
     sentence,
     simulated,
+    to_decide,
     undecided,
     where,
     which,
@@ -30,14 +32,24 @@ from ssmppl.diagnosis.report.words import (
 from ssmppl.diagnosis.verdict.verdicts import VERDICTS
 from ssmppl.drawing.numerals import DASH, interval, number, p_text, percent, span, with_error
 from ssmppl.errors import ArgumentError
-from tests.diagnosis.made_up import ALL, NAN, effect_found, fast, no_gap, none_of_these, several
+from tests.diagnosis.made_up import (
+    ALL,
+    NAN,
+    effect_found,
+    fast,
+    no_gap,
+    none_of_these,
+    separation,
+    several,
+    with_experiment,
+)
+
+OPTIONAL = ("missing", "formula", "signals", "left_out")  # tables
 
 
 def empty(verdict="no measurable gap", **fields):
     """A report that holds nothing."""
-    tables = {
-        name: tabulate(name) for name in COLUMNS if name not in ("missing", "formula", "left_out")
-    }
+    tables = {name: tabulate(name) for name in COLUMNS if name not in OPTIONAL}
     return GapReport(verdict=verdict, **tables, **fields)
 
 
@@ -259,14 +271,95 @@ def test_the_curve_of_none_of_these_is_told_where_its_band_leaves_zero():
     assert "largest" not in " ".join(which(flat))
 
 
-def test_what_would_tell_rivals_apart_is_named():
-    steps = " ".join(next_steps(effect_found()))
-    assert "record data with a slow sine of u that keeps x small while v is large" in steps
+def test_what_to_do_next():
     unknown = dataclasses.replace(several(), chosen=["input saturation"])
-    assert "None of the simple inputs" in " ".join(next_steps(unknown))
+    assert "distinguish input saturation of u1, dead zone of u1, cubic stiffness in speed[0] " \
+           "from 2 more, add a sensor" in " ".join(next_steps(unknown))  # fmt: skip
     assert "full mode" in " ".join(next_steps(fast()))
+    assert "distinguish" not in " ".join(next_steps(fast()))
     stopped = dataclasses.replace(effect_found(), interrupted=True)
     assert "resumes from the completed stages" in next_steps(stopped)[0]
+
+
+# -- what would tell rivals apart
+RIVALS = "These records do not tell quadratic drag in v from state-dependent damping in v."
+
+
+def test_an_experiment_is_told_in_words_with_its_figures():
+    found = with_experiment()
+    assert to_decide(found) == [
+        RIVALS,
+        "A triangle of u between −1 and 1 with a period of 40 rows would (expected log-likelihood "
+        "ratio 7.2 nats between the two, 5.4 are enough; with the recorded inputs: 0.8): "
+        "experiment.csv.",
+        "It keeps u within its recorded range and, by the models, what is observed near its own.",
+        "Without it, it would take more than 5 times as many rows with the recorded inputs as the "
+        "400 of this record.",
+    ]
+    text = " ".join(str(found).split())
+    assert "To decide These records do not tell quadratic drag" in text
+    assert text.index("How sure") < text.index("To decide") < text.index("effect form strength")
+    steps = " ".join(next_steps(found))
+    assert "run experiment.csv (report.experiment in Python) on the system" in steps
+
+
+def test_an_experiment_to_be_run_several_times():
+    """2.2 nats a run are enough in three, which is no more than were recorded; not so in two."""
+    told = " ".join(to_decide(with_experiment(separation(2.2, records=3))))
+    assert "40 rows would, run 3 times (expected log-likelihood ratio 2.2 nats between the two " \
+           "in each run, 5.4" in told  # fmt: skip
+    assert "as the 400 of the longest record" in told
+    told = " ".join(to_decide(with_experiment(separation(2.2, recorded=1.35, records=2))))
+    assert "None of the 4 signals of u that were tried would; the best, a triangle of u between " \
+           "−1 and 1 with a period of 40 rows, has an expected log-likelihood ratio of 2.2 nats " \
+           "between the two, and 5.4 are needed (with the recorded inputs: 1.4). Under 1 of them " \
+           "the models, as they are fitted, predict nearly the same and under 1 of them what is " \
+           "observed leaves its recorded range. It would take about 1,600 rows with the " \
+           "recorded inputs, 4 times as many as the 400" in told  # fmt: skip
+
+
+def test_where_nothing_separates_it_is_said_and_no_file_named():
+    nothing = with_experiment(separation(0.4))
+    told = " ".join(to_decide(nothing))
+    assert "None of the 4 signals" in told
+    assert "the best" not in told  # than nothing
+    assert "little difference" not in told
+    alike = tuple(dataclasses.replace(t, note=ALIKE, nats=NAN) for t in separation().tried)
+    told = to_decide(with_experiment(separation(tried=alike)))
+    assert "In the recorded range it makes little difference which of them is used." in told
+    for report in (nothing, with_experiment(separation(tried=alike))):
+        assert "experiment.csv" not in str(report)
+        assert "add a sensor" in " ".join(next_steps(report))
+
+
+def test_where_the_recorded_inputs_do_nothing_else_is_needed():
+    found = with_experiment(separation(recorded=6.0, tried=()))
+    assert to_decide(found) == [
+        RIVALS,
+        "Another 400 rows with the recorded inputs are expected to (expected log-likelihood ratio "
+        "6 nats between the two, 5.4 are enough): no other experiment is needed.",
+    ]
+    assert "record as much again" in " ".join(next_steps(found))
+
+
+def test_without_an_input_to_vary_more_rows_are_the_answer():
+    nothing = np.empty((400, 0))
+    found = with_experiment(separation(recorded=2.7, tried=(), recorded_inputs=nothing))
+    assert to_decide(found)[1:] == [
+        "There is no input to vary: it would take about 800 rows of this kind, 2 times as many as "
+        "the 400 of this record (expected log-likelihood ratio of these: 2.7 nats between the two; "
+        "5.4 are needed)."
+    ]
+
+
+def test_of_many_rivals_the_hardest_pair_is_meant():
+    three = (("stribeck", "v"), *separation().effects)
+    told = to_decide(with_experiment(separation(7.2, effects=three, members=5)))
+    assert told[0] == "These records do not tell stribeck in v, quadratic drag in v and " \
+                      "state-dependent damping in v apart (the first 3 of 5)."  # fmt: skip
+    assert "7.2 nats between the two that are hardest to tell apart, 5.4" in told[1]
+    assert to_decide(effect_found()) == []
+    assert "To decide" not in str(effect_found())
 
 
 def test_what_does_not_apply_is_told_with_its_reason():

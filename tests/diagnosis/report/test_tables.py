@@ -3,8 +3,11 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
+import ssmppl as ssm
+from ssmppl.data import bind, bind_inputs
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.catalogue_motion import (
     level_break,
@@ -13,16 +16,24 @@ from ssmppl.diagnosis.effects.catalogue_motion import (
     random_walk_load,
 )
 from ssmppl.diagnosis.effects.catalogue_sensor import sensor_rectification
+from ssmppl.diagnosis.experiment.design import ALIKE, BEHIND, OUTSIDE
 from ssmppl.diagnosis.report.tables import (
     _experiments,
     _when,
     bonferroni,
     causes_table,
+    classes_table,
     estimated_strength,
+    experiment_table,
+    signals_table,
     where_table,
 )
 from ssmppl.diagnosis.screening.location import localise
+from ssmppl.diagnosis.selection.equivalence import Classes
 from ssmppl.drawing.numerals import label, span
+from ssmppl.language.tracing import trace
+from ssmppl.modelfile import read_csv
+from tests.diagnosis.made_up import separation
 from tests.statistics.checks import seed_of
 
 DRAG = Candidate(quadratic_drag, "v", strength="drag")
@@ -145,3 +156,96 @@ def test_a_strength_at_its_upper_bound_is_not_shown_as_none(strength, shown):
     )
     row = estimated_strength(SimpleNamespace(experiments=[]), fit, c)
     assert row["estimate"] == shown
+
+
+# -- the experiment
+def model_with(inputs, **options):
+    """A walk that a sum of inputs drives."""
+    model = ssm.Model("driven", inputs=inputs, **options)
+    names = list(inputs)
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+
+    def transition(x, u):
+        return {"x": ssm.Normal(x + np.sum(u), sd=1)}
+
+    if "dt" in names:
+
+        def transition(x, u, dt):
+            return {"x": ssm.Normal(x + dt * np.sum(u), sd=1)}
+
+    model.transition(transition)
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    return model
+
+
+def experiments_of(model, *data):
+    traced = trace(model)
+    return traced, [e for d in data for e in bind(traced, d)]
+
+
+def made(traced, experiments, inputs):
+    return experiment_table(traced, experiments, separation(7.0, inputs=inputs))
+
+
+def test_an_experiment_has_a_row_for_each_of_the_longest_record():
+    y = {n: np.zeros(n) for n in (5, 8)}
+    given = [{"y": v, "u": np.ones(n)} for n, v in y.items()]
+    traced, found = experiments_of(model_with(("u",)), *given)
+    table = made(traced, found, np.arange(8.0)[:, None])
+    assert list(table.columns) == ["u"]
+    np.testing.assert_array_equal(table["u"], np.arange(8.0))
+    labelled = [d | {"time": 10.0 * np.arange(len(d["y"]))} for d in given]
+    table = made(traced, experiments_of(model_with(("u",)), *labelled)[1], np.ones((8, 1)))
+    np.testing.assert_array_equal(table["time"], 10.0 * np.arange(8))
+    assert experiment_table(traced, found, separation(7.0, inputs=None)) is None
+
+
+def test_components_and_labels_of_rows_are_read_back_as_inputs(tmp_path):
+    """A vector takes two columns; the labels come back, and the values to the last digit."""
+    model = model_with({"u": 2})
+    data = pd.DataFrame({"y": np.zeros(6), "u_0": 1.0, "u_1": np.arange(6.0)},
+                        index=pd.Index(0.5 * np.arange(6), name="time"))  # fmt: skip
+    traced, found = experiments_of(model, data)
+    wanted = np.random.default_rng(3).standard_normal((6, 2))
+    table = made(traced, found, wanted)
+    assert list(table.columns) == ["time", "u_0", "u_1"]
+    table.to_csv(tmp_path / "experiment.csv", index=False)
+    u, rows, source = bind_inputs(traced, read_csv(tmp_path / "experiment.csv"), None)
+    np.testing.assert_array_equal(u, wanted)
+    np.testing.assert_array_equal(source.time, data.index)
+    assert rows == 6
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_the_length_of_a_step_is_left_to_the_labels_where_it_follows_from_them(own):
+    times = np.array([0.0, 1.0, 3.0, 4.0])
+    given = {"y": np.zeros(4), "u": np.arange(4.0), "time": times}
+    if own:
+        given["dt"] = np.full(4, 0.1)
+    traced, found = experiments_of(model_with(("u", "dt"), time_step="dt"), given)
+    table = made(traced, found, found[0].u)
+    assert list(table.columns) == ["time", "u", *["dt"] * own]
+    u, *_ = bind_inputs(traced, table, None)
+    np.testing.assert_array_equal(u, found[0].u)
+
+
+def test_signals_stand_behind_the_recorded_inputs():
+    table = signals_table(separation(7.2, 3.1))
+    assert list(table["signal"][:2]) == [
+        "as recorded", "a triangle of u between −1 and 1 with a period of 40 rows"
+    ]  # fmt: skip
+    np.testing.assert_allclose(table["nats"][:3], [0.8, 7.2, 3.1])
+    assert list(table["note"][-3:]) == [OUTSIDE, ALIKE, BEHIND]
+    assert signals_table(separation(tried=())) is None
+
+
+def test_the_first_class_has_the_signal_that_separates_it():
+    names = [DRAG, LOAD, WAVE, BREAK]
+    screen = SimpleNamespace(design=SimpleNamespace(candidates=names))
+    found = Classes(np.array([1, 1, 2, 2]), np.array([0, 0, 2, 2]), np.array([1, 0.9, 1, 0.9]))
+    for separated, words in ((separation(7.2), "a triangle of u"), (separation(0.3), ""),
+                             (None, "")):  # fmt: skip
+        table = classes_table(screen, found, range(4), separated)
+        first, second = (table[table["class_id"] == k]["separating_input"] for k in (1, 2))
+        assert all(s.startswith(words) and bool(s) == bool(words) for s in first)
+        assert list(second) == ["", ""]

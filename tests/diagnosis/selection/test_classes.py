@@ -13,10 +13,8 @@ from ssmppl.diagnosis.selection.equivalence import (
     cuts,
     distinguishable,
     separating_gain,
-    separating_input,
     similarity,
 )
-from ssmppl.errors import ArgumentError
 from tests.statistics.checks import LEVEL, seed_of
 
 
@@ -118,22 +116,3 @@ def test_a_confidence_set_with_its_own_cuts():
         confidence_set(np.array([10.0, 7.5, 7.5, np.nan]), np.array([2.0, 2.0, 3.0, 2.0])),
         [True, False, True, False],
     )
-
-
-def test_the_input_that_separates():
-    """Two members: gain (1 - |rho|) by hand; three: the hardest pair counts."""
-    weak = np.array([[4.0, 3.8], [3.8, 4.0]])
-    strong = np.array([[9.0, 3.0], [3.0, 4.0]])
-    found = separating_input([0, 1], np.array([2.0, 2.0]), {"steps": weak, "chirp": strong})
-    assert found.nats["steps"] == pytest.approx(8 * 0.05)
-    assert found.nats["chirp"] == pytest.approx(8 * 0.5)  # the member with less information
-    assert (found.input, found.separable) == ("chirp", True)
-    assert not separating_input([0, 1], np.array([2.0, 2.0]), {"steps": weak}).separable
-    three = np.eye(3)
-    three[0, 2] = three[2, 0] = 0.99
-    found = separating_input([0, 1, 2], np.full(3, 4.0), {"a": three})
-    assert found.nats["a"] == pytest.approx(8 * 0.01)
-    dead = np.diag([1.0, 0.0])
-    assert separating_input([0, 1], np.ones(2), {"a": dead}).nats["a"] == 0.0
-    with pytest.raises(ArgumentError, match="1 members"):
-        separating_input([0], np.ones(2), {"a": dead})
