@@ -46,6 +46,7 @@ AFRESH = "refitting from default start"
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is run
 CARRIES_ON = 0.1  # of what a further cause gains one row ahead, that it has to gain beyond
+MOST_LOST = 1.0  # nats, further ahead, by what only describes a misfit
 FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
 AGAIN_CALLED = 60  # likewise, of a model that calls a simulator
 FIRST_LOOK, NOTHING = 30, 0.5  # of these sets first; a family-wise p of so much by them is no gap
@@ -384,7 +385,7 @@ def _simulates(r: Refit, new: Sequence[Candidate], worth: float) -> bool:
     """Whether the effects `new` are of a simulator, by what they gain beside those chosen: a cause
     gains further ahead too, and what only describes a misfit loses next to nothing there."""
     if any(c.effect.cause in (UNKNOWN_INPUT, NOISE_LAW) for c in new):
-        return r.score > 0.0 and r.ahead >= -worth
+        return r.score > 0.0 and r.ahead >= -MOST_LOST
     return r.ahead >= CARRIES_ON * r.penalised_gain - worth
 
 
