@@ -10,11 +10,9 @@ the few, and one of them may lie forty standard deviations out: enough to hide e
 the distribution of the largest. Given where the states went the information is known, and the score
 is compared with that (D. Cox and D. Hinkley, *Theoretical Statistics* 1974, section 4.8, on
 observed and expected information): a score S with the sum of squares R of its rows is divided by
-sqrt(R / (2 r)) where R is more than twice the r of a typical set, and by sqrt(2 R / r) where it is
-less than half of it: sets that are simulated from a wrong fit may run far out of the range that the
-data keep to, where a stiffness or a drag has many times the information, and would hide what there
-is of it in the data. In between nothing is changed, as R counts what is unmodelled along with the
-information.
+sqrt(R / (2 r)) where R is more than twice the r of a typical set. Below that nothing is changed, as
+R counts what is unmodelled along with the information, and scores whose rows depend on each other
+have more of it than their squares say.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import WHOLE, segments
 
-FREE = 2.0  # times a typical set's sum of squares, or its inverse, between which a score is left
+FREE = 2.0  # times a typical set's sum of squares, up to which a score is left as it is
 
 
 def autoregressive(
@@ -72,7 +70,4 @@ def typical_squares(squares: np.ndarray) -> np.ndarray:
 
 def information_scale(squares: np.ndarray, typical: np.ndarray) -> np.ndarray:
     """What scores with sums of squares (..., K) are divided by, where (K,) are typical."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.where(squares > 0.0, squares / typical, 1.0)
-        scale = np.sqrt(np.fmax(share / FREE, 1.0) * np.fmin(share * FREE, 1.0))
-    return np.where(np.isfinite(scale), scale, 1.0)
+    return np.sqrt(np.fmax(squares / (FREE * typical), 1.0))

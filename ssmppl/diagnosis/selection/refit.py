@@ -251,7 +251,7 @@ def start_at(
 
 def leading(screen: Screen) -> list[int]:
     """The best shape of each of the best groups, the highest first; of those that are almost the
-    same as one above them none, unless they are asked earlier (`ASKED`), whose place they take.
+    same as one above them only those that are asked earlier (`ASKED`).
 
     What fits any misfit stands high at a fit far from the truth: of changes in time, of unknown
     inputs and of laws of the noise there are `MOST_OF_A_KIND` each and `MOST_OF_NO_CAUSE` in all,
@@ -262,7 +262,7 @@ def leading(screen: Screen) -> list[int]:
     for k in _promising(screen):
         same = [j for j in different if abs(screen.efficient.rho[k, j]) >= SAME]
         if all(ASKED[cause[k]] < ASKED[cause[j]] for j in same):
-            different = [j for j in different if j not in same] + [k]
+            different.append(k)
     counts, first, later = Counter[str](), [], []
     for k in different:
         kind = cause[k]

@@ -25,8 +25,6 @@ def test_division():
     usual = np.array([2.0, 2.0, 2.0, np.nan])
     by = information_scale(np.array([1.0, 4.0 * FREE, 36.0 * FREE, 5.0]), usual)
     np.testing.assert_allclose(by, [1.0, np.sqrt(2.0), np.sqrt(18.0), 1.0])
-    by = information_scale(np.array([2.0 / FREE, 0.5 / FREE, 0.02 / FREE, 5.0]), usual)
-    np.testing.assert_allclose(by, [1.0, 0.5, 0.1, 1.0])
     assert np.all(information_scale(np.zeros(4), usual) == 1.0)
 
 
@@ -75,37 +73,6 @@ def test_level_and_power(strength):
         found.append(tail_p(abs(seen.statistic[0]), np.abs(seen.null[:, 0])))
     share = np.mean(np.array(found) <= 0.05)
     print(strength, share)
-    if strength == 0.0:
-        assert share <= 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 300)
-    else:
-        assert share >= 0.9
-
-
-@pytest.mark.parametrize("strength", [0.0, 0.5])
-def test_sets_that_run_far_out_do_not_hide_what_the_data_tell(strength):
-    """Simulated sets in which a state goes ten times as far as in the data, as of a wrong fit that
-    runs away: a drag has ten thousand times the information there."""
-    rng = np.random.default_rng(seed_of("far out", strength))
-
-    def drag(sets, reach):
-        v = reach * rng.standard_normal((sets, ROWS))
-        return v * np.abs(v), rng.standard_normal((sets, ROWS))
-
-    found = []
-    for _ in range(300):
-        activity, noise = drag(200, 10.0)
-        rows = activity * noise
-        squares = np.sum(rows**2, axis=1, keepdims=True)
-        usual = typical_squares(squares)
-        law = Null.of(
-            rows.sum(axis=1, keepdims=True) / information_scale(squares, usual), np.zeros((200, 0))
-        )
-        activity, noise = drag(1, 1.0)
-        own = (activity * (noise + strength * activity))[0]
-        by = information_scale(np.array([np.sum(own**2)]), usual)
-        seen = efficient(law, np.array([own.sum()]) / by, np.zeros(0))
-        found.append(tail_p(abs(seen.statistic[0]), np.abs(seen.null[:, 0])))
-    share = np.mean(np.array(found) <= 0.05)
     if strength == 0.0:
         assert share <= 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 300)
     else:
