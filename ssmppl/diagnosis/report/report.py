@@ -32,16 +32,6 @@ class GapReport(Findings):
         Effects that these data cannot tell apart share a `class_id`.
     classes : the members of each class, their correlation `rho` with the best one, and in words
         the input that would separate them best ("" if none would, or none was looked for).
-    experiment : inputs under which a further record is expected to tell the first class apart, to
-        be run on the machine: one row for each of the longest record, its labels in `time` if it
-        has any. None if there is no such class, or no signal within the recorded range would do.
-        `ssm.simulate(model, values, inputs=report.experiment)` takes it.
-    separation : how far the members of the first class come apart: `recorded`, the expected
-        log-likelihood ratio in nats of the hardest pair with the recorded inputs, `best`, the
-        signal with the largest one and its `nats`, `needed` (5.4), `runs` of the experiment that
-        these take, and `times_as_many` records of the recorded kind. None if it was not looked for.
-    signals : what was tried, best first: the expected log-likelihood ratio of each in `nats`, or a
-        `note` why it has none. None if nothing was tried.
     closed : what the chosen effects do on data that took no part in choosing them, a row for each
         `horizon`: rows ahead of a filtered state ("10"), a window of them ("1 to 50"), or the "free
         run" from the first row on. `rmse_before`, `rmse_after`, the `share` of the error that is
@@ -59,6 +49,16 @@ class GapReport(Findings):
     formula : where the verdict is "none of these", the terms of the formula that comes nearest to
         what is missing, a suggestion: the increment of the equation's mean a row is the sum of
         coefficient times term. `share` is that of the curves' gain which all of them have.
+    signals : what was tried, best first: the expected log-likelihood ratio of each in `nats`, or a
+        `note` why it has none. None if nothing was tried.
+    experiment : inputs under which a further record is expected to tell the first class apart, to
+        be run on the machine: one row for each of the longest record, its labels in `time` if it
+        has any. None if there is no such class, or no signal within the recorded range would do.
+        `ssm.simulate(model, values, inputs=report.experiment)` takes it.
+    separation : how far the members of the first class come apart: `recorded`, the expected
+        log-likelihood ratio in nats of the hardest pair with the recorded inputs, `best`, the
+        signal with the largest one and its `nats`, `needed` (5.4), `runs` of the experiment that
+        these take, and `times_as_many` records of the recorded kind. None if it was not looked for.
     model, model_text : the model with the chosen effects added, and its file; None and "" if
         nothing was chosen.
     chosen : labels of the chosen effects: the effect's name, or "<effect> on <equation>" where
