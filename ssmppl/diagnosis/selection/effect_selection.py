@@ -17,7 +17,7 @@ import numpy as np
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.effects.effect import NOISE_LAW, UNKNOWN_INPUT
+from ssmppl.diagnosis.effects.effect import CHANGE_IN_TIME, NOISE_LAW, UNKNOWN_INPUT
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import FROM_START, Fit
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
@@ -386,7 +386,8 @@ def _simulates(r: Refit, new: Sequence[Candidate], worth: float) -> bool:
     gains further ahead too, and what only describes a misfit loses next to nothing there."""
     if any(c.effect.cause in (UNKNOWN_INPUT, NOISE_LAW) for c in new):
         return r.score > 0.0 and r.ahead >= -MOST_LOST
-    return r.ahead >= CARRIES_ON * r.penalised_gain - worth
+    once = any(c.effect.cause == CHANGE_IN_TIME for c in new)  # no other record will have it
+    return r.ahead >= CARRIES_ON * r.penalised_gain - worth * (not once)
 
 
 def _others(screen: Screen, chosen: Refit) -> list[Candidate]:

@@ -418,6 +418,8 @@ def test_what_describes_a_misfit_comes_behind_a_cause_that_explains_it(refits, f
         ("mechanism", 266.0, -3.0, False),  # a delay beside a cubic spring
         ("mechanism", 266.0, 60.0, True),
         ("noise law", 20.0, -1.0, True),
+        ("change in time", 20.0, 1.0, False),  # a jump in one row gains there alone
+        ("change in time", 20.0, 3.0, True),
         ("noise law", 20.0, -2.0, False),
         ("noise law", 100.0, -67.0, False),  # as on a servo: simulations a third further off
         ("unknown input", 100.0, 3.0, True),
