@@ -1,7 +1,7 @@
 """What a two-link arm in MuJoCo lacks, by `ssm.diagnose` on records of arms that have more.
 
     python bench/arm_effects.py [--kinds friction stop delay drag none] [--seeds 1 2 3 4 5]
-        [--rows 500] [--mode full] [--threads 2]
+        [--rows 500] [--mode full] [--processes 2]
 
 The real arm is the model's file with one thing more, which the diagnosis is not told: dry friction
 in the elbow (`frictionloss`), a stop at 65 degrees either way, motors that act four rows late, a
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import logging
+import os
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -26,6 +27,7 @@ from arms import ENCODER, XML, by_sysid, simulator, torques
 from table import show
 
 import ssmppl as ssm
+from ssmppl.inference.run.executors import processes
 
 TRUTH = {"d1": 0.2, "d2": 0.1, "m": 0.6, "s1": 0.02, "s2": 0.04}
 LATE = 4  # rows
@@ -115,23 +117,32 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])
     parser.add_argument("--rows", type=int, default=500)
     parser.add_argument("--mode", default="full", choices=("fast", "full"))
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     logging.getLogger("absl").setLevel(logging.ERROR)
-    arm, rows = model(XML, options.threads), []
+    arm, rows = model(XML, 1), []
     for seed in options.seeds:
         for kind in options.kinds:
             data = record(kind, options.rows, seed)
-            begun, cpu = time.perf_counter(), time.process_time()
-            report = ssm.diagnose(arm, data, mode=options.mode, seed=seed, progress=False)
-            seconds = time.perf_counter() - begun
+            begun = time.perf_counter(), cpu_seconds()
+            with processes(options.processes) as pool:
+                report = ssm.diagnose(
+                    arm, data, mode=options.mode, seed=seed, progress=False, executor=pool
+                )
+            seconds, cpu = time.perf_counter() - begun[0], cpu_seconds() - begun[1]
             carried = " ".join(str(v) for v in report.attributes.values())
             rows.append([
                 kind, str(seed), "right" if right(kind, report) else "wrong", told(report),
-                carried, f"{seconds:.0f}", f"{time.process_time() - cpu:.0f}", sysid(data),
+                carried, f"{seconds:.0f}", f"{cpu:.0f}", sysid(data),
             ])  # fmt: skip
             print(*rows[-1], f"{len(report.left_out)} parts left out", sep=" | ", flush=True)
     show(["missing", "seed", "", "first", "in the file", "s", "CPU s", "mujoco.sysid"], rows)
+
+
+def cpu_seconds() -> float:
+    """Of this process and of those that it has waited for."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
 
 
 if __name__ == "__main__":

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 import ssmppl as ssm
+from ssmppl.analysis.structure import simulators
 from ssmppl.cli.group import command
 from ssmppl.cli.options import FIXED, MODEL, NEEDED_DATA, PROGRESS, option, output
 from ssmppl.cli.reading import read_data
 from ssmppl.cli.rendering import answer, records, say, stop_in_part, stop_interrupted, wrote
 from ssmppl.errors import ArgumentError
+from ssmppl.inference.run.executors import cpu_count, processes
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model, parse_assignments
 
 if TYPE_CHECKING:
@@ -80,6 +84,11 @@ def _made(folder: Path) -> Path:
     help="Keeps the stages that are done [default: stages/ in the folder of the report].",
 )  # fmt: skip
 @option(
+    "--workers", type=click.IntRange(1), section="Run",
+    help="Processes that share the simulated sets and refits [default: threads of this one; where "
+    "the model calls a simulator, as many processes as cores].",
+)  # fmt: skip
+@option(
     "--debug", is_flag=True, section="Run", show_default=False,
     help="Stop at the first internal error with its traceback, where else its part is left out.",
 )  # fmt: skip
@@ -88,7 +97,8 @@ def _made(folder: Path) -> Path:
 def diagnose(
     model: str, data: tuple[Path, ...], output: Path | None, mode: str, fast: bool,
     fixed: tuple[str, ...], effects: str | None, particles: int | None, alpha: float,
-    horizon: int | None, seed: int, checkpoint: Path | None, debug: bool, progress: bool,
+    horizon: int | None, seed: int, checkpoint: Path | None, workers: int | None, debug: bool,
+    progress: bool,
 ) -> None:  # fmt: skip
     """Where MODEL.py differs from DATA, which effect is missing, how far the gap closes.
 
@@ -109,12 +119,15 @@ def diagnose(
     loaded, read = load_model(model), read_data(data)
     folder = _made(output or Path(f"{data[0].stem}_report"))
     kept = checkpoint or folder / CHECKPOINT
+    if workers is None:  # Python code holds the others up, compiled code does not
+        workers = cpu_count() if simulators(trace(loaded)) else 1
     try:
-        report: GapReport = ssm.diagnose(
-            loaded, read, names, mode="fast" if fast else mode, alpha=alpha, fixed=held or None,
-            particles=particles, checkpoint=kept, progress=progress, seed=seed, debug=debug,
-            horizon=horizon,
-        )  # fmt: skip
+        with processes(workers) if workers > 1 else nullcontext() as executor:
+            report: GapReport = ssm.diagnose(
+                loaded, read, names, mode="fast" if fast else mode, alpha=alpha,
+                fixed=held or None, particles=particles, checkpoint=kept, progress=progress,
+                seed=seed, debug=debug, horizon=horizon, executor=executor,
+            )  # fmt: skip
     except KeyboardInterrupt:
         stop_interrupted(f"before there was anything to report. {kept} holds the stages that are "
                          "done: the same command resumes from there.")  # fmt: skip

@@ -15,8 +15,9 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.run import progress as progress_module
+from ssmppl.inference.run.executors import workers_of
 from ssmppl.inference.run.progress import Progress, announced
-from tests.cli.shared import QUICK, answer, fails, interrupted_after, run
+from tests.cli.shared import QUICK, answer, fails, interrupted_after, run, write
 from tests.diagnosis.made_up import effect_found
 
 ROOT = Path(__file__).parent.parent.parent
@@ -284,6 +285,56 @@ def test_an_interrupted_diagnosis_says_what_is_kept(series, monkeypatch):
     result = run(*words, "--json", code=130)
     assert "out/stages holds the stages that are done" in result.stderr
     assert result.stdout == ""
+
+
+CALLED = """
+import ssmppl as ssm
+
+@ssm.simulator(state=("x",))
+def halved(state, inputs, parameters):
+    return 0.5 * state
+
+model = ssm.Model("halved")
+
+@model.prior
+def prior():
+    return {"q": ssm.HalfNormal(sd=1.0)}
+
+@model.initial
+def initial():
+    return {"x": ssm.Normal(0.0, sd=1.0)}
+
+@model.transition
+def transition(x, q):
+    return {"x": ssm.Normal(halved([x], [], []).x, sd=q)}
+
+@model.observation
+def observation(x):
+    return {"y": ssm.Normal(x, sd=0.5)}
+"""
+
+
+@pytest.mark.parametrize(
+    ("model", "words", "workers"),
+    [("walk.py", (), None), ("walk.py", ("--workers", 3), 3), ("walk.py", ("--workers", 1), None),
+     ("called.py", (), 2), ("called.py", ("--workers", 1), None)],
+)  # fmt: skip
+def test_a_diagnosis_shares_simulators_over_processes(series, monkeypatch, model, words, workers):
+    seen = []
+
+    def diagnose(*args, executor, **settings):
+        seen.append(executor)
+        return dataclasses.replace(effect_found(), missing=None)
+
+    write("called.py", CALLED)
+    monkeypatch.setattr("ssmppl.cli.diagnosis.cpu_count", lambda: 2)
+    monkeypatch.setattr(ssm, "diagnose", diagnose, raising=False)
+    run("diagnose", model, series, *words, "-o", "out")
+    (executor,) = seen
+    assert (executor and workers_of(executor)) == workers
+    if executor:
+        with pytest.raises(RuntimeError, match="after shutdown"):
+            executor.submit(int)
 
 
 def test_an_interrupted_evidence_says_what_it_is_made_of(series, monkeypatch):

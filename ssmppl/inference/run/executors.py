@@ -9,7 +9,9 @@ know it says so (`Absent`), and gets the whole.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
 import sys
 import threading
 import uuid
@@ -19,6 +21,7 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
+    ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
@@ -194,6 +197,18 @@ def threads_unless(executor: Executor | None, tasks: int) -> Iterator[Executor]:
         return
     with ThreadPoolExecutor(max_workers=max(1, min(tasks, cpu_count()))) as threads:
         yield threads
+
+
+@contextmanager
+def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """So many processes, which leave Ctrl-C to the one that waits for them. The script that asks
+    needs the line `if __name__ == "__main__":`, as each of them imports it."""
+    context = multiprocessing.get_context("spawn")  # threads are running here: no fork
+    pool = ProcessPoolExecutor(workers, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def cpu_count() -> int:

@@ -494,3 +494,8 @@ def test_how_many_workers_there_are(client):
     assert workers_of(None) is None
     assert workers_of(ThreadPoolExecutor(3)) == 3
     assert workers_of(client.get_executor()) == 2
+
+
+def test_processes_leave_ctrl_c_to_the_one_that_waits():
+    with executors.processes(1) as pool:
+        assert pool.submit(signal.getsignal, signal.SIGINT).result() == signal.SIG_IGN
