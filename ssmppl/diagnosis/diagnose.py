@@ -306,7 +306,8 @@ class _Diagnosis:
         )
 
     def _held_out_gain(self, r: Results) -> HeldOutGain:
-        once = r.chosen is not None and any(is_pulse(c) for c in r.chosen.candidates)
+        # Beside a pulse, which later rows cannot tell of, they tell what carries on.
+        once = r.chosen is not None and all(is_pulse(c) for c in r.chosen.candidates)
         if self.split and not once:
             best = r.refits[0] if r.refits else None
             simulation = r.selection.simulation if r.selection else None

@@ -14,6 +14,7 @@ from functools import partial
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, refine_wave, starts_of
 from ssmppl.diagnosis.effects.effect import (
@@ -290,7 +291,9 @@ def correlated_candidates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
 
 def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     """The other numbers of states, as delays are, of those near the best that have one, and the
-    dates next to those that are dated: nothing between two of them can be estimated."""
+    dates next to those that are dated: nothing between two of them can be estimated. Of a model
+    that calls a simulator no further dates: half a minute each for a nat or two."""
+    called = bool(simulators(screen.design.trace))
     near = [r.index[0] for r in refits if refits[0].penalised_gain - r.penalised_gain <= NEAR]
     out: list[int] = []
     for best in near:
@@ -299,7 +302,7 @@ def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
         group = [k for k in every if k != best and not screen.efficient.status[k]]
         if any(c.effect.states.values()) and len(out) < CORRELATED:
             out += group
-        elif is_dated(c) and len(out) < CORRELATED:
+        elif is_dated(c) and len(out) < CORRELATED and not called:
             dates = {k: float(dict(screen.design.candidates[k].shape)["date"]) for k in group}
             own = float(dict(c.shape)["date"])
             out += sorted(group, key=lambda k: abs(dates[k] - own))[:NEIGHBOURS]

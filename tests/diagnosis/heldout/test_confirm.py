@@ -2,6 +2,7 @@
 
 import warnings
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -194,3 +195,21 @@ def test_a_stretch_is_shared_out_over_rows_with_data():
     fitter = SimpleNamespace(estimate=lambda own, theta, stream: -2.0 * own[0].seen.sum())
     found = stretches(fitter, fit, e, counts, np.empty(0))
     np.testing.assert_allclose(found, np.where(e.seen.any(axis=1) & counts, -2.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("profiles", "by"),
+    [(("",), "later rows"), (("", "pulse"), "later rows"), (("pulse",), "blocks"),
+     (("pulse", "pulse"), "blocks"), (("step",), "later rows")],
+)  # fmt: skip
+def test_later_rows_tell_of_all_but_what_happened_once(monkeypatch, profiles, by):
+    def measured(name):
+        return lambda *args: SimpleNamespace(gain=lambda *args: name)
+
+    monkeypatch.setattr(diagnose, "HeldOutRows", measured("later rows"))
+    monkeypatch.setattr(diagnose, "CrossValidation", measured("blocks"))
+    for name in ("AugmentedModels", "ScreenDesign", "replace"):
+        monkeypatch.setattr(diagnose, name, lambda *args, **settings: MagicMock())
+    effects = [SimpleNamespace(effect=SimpleNamespace(profile=p)) for p in profiles]
+    results = MagicMock(chosen=SimpleNamespace(candidates=effects))
+    assert diagnose._Diagnosis._held_out_gain(MagicMock(), results) == by

@@ -247,18 +247,21 @@ def refit_at(k, penalised_gain):
     return Refit((k,), (), None, None, gain=penalised_gain)
 
 
+NO_SITES = SimpleNamespace(parameters={}, initial={}, transition={}, observations={})
+
+
 def delayed_screen():
     """Columns 0 to 2 are the delays of one effect, 3 is an effect without, 4 and 5 another's."""
     delayed = SimpleNamespace(effect=SimpleNamespace(states={"past": "delay"}, profile=""))
     plain = SimpleNamespace(effect=SimpleNamespace(states={"held": None}, profile=""))
     return SimpleNamespace(
-        design=SimpleNamespace(candidates=[delayed] * 3 + [plain] + [delayed] * 2),
+        design=SimpleNamespace(candidates=[delayed] * 3 + [plain] + [delayed] * 2, trace=NO_SITES),
         groups=np.array([7, 7, 7, 3, 8, 8]),
         efficient=SimpleNamespace(status=["", "", "too little", "", "", ""]),
     )
 
 
-def test_dates_next_to_that_of_a_break_near_the_best_are_refitted():
+def test_dates_next_to_that_of_a_break_near_the_best_are_refitted(monkeypatch):
     def dated(day, profile="step"):
         return SimpleNamespace(
             effect=SimpleNamespace(states={}, profile=profile), shape=(("date", float(day)),)
@@ -266,13 +269,17 @@ def test_dates_next_to_that_of_a_break_near_the_best_are_refitted():
 
     days = [3, 9, 10, 11, 12, 13, 14, 15, 40]
     screen = SimpleNamespace(
-        design=SimpleNamespace(candidates=[dated(d) for d in days] + [dated(12, "pulse")]),
+        design=SimpleNamespace(
+            candidates=[dated(d) for d in days] + [dated(12, "pulse")], trace=NO_SITES
+        ),
         groups=np.array([1] * 9 + [2]),
         efficient=SimpleNamespace(status=["", "", "", "too little"] + [""] * 6),
     )
     found = delays(screen, [refit_at(4, 10.0)])
     assert sorted(days[k] for k in found) == [3, 9, 10, 13, 14, 15]
     assert delays(screen, [refit_at(0, 100.0), refit_at(4, 10.0)])[:1] == [1]
+    monkeypatch.setattr("ssmppl.diagnosis.selection.refit.simulators", lambda trace: ("arm",))
+    assert delays(screen, [refit_at(4, 10.0)]) == [], "each would call the simulator for long"
 
 
 def test_other_delays_of_those_near_the_best_are_refitted():
