@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import Fitter
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.diagnosis.model.smoothing import Settings, Smoother
+from ssmppl.diagnosis.selection.refit import only_by_particles, refit
+from ssmppl.errors import NotApplicable
 from ssmppl.inference.batched.extended import extended_model
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -141,6 +144,28 @@ def test_a_sensor_that_jumps_is_not_tried():
         found, refused = offers(t, scales, ["quantisation", "sensor clipping"])
         assert len({c.effect.name for c in found}) == 1 + wanted
         assert [r.effect for r in refused if "jumps" in r.reason] == ["quantisation"] * (1 - wanted)
+
+
+def test_what_only_particles_can_fit_is_not_refitted():
+    """Outliers of a state have no Gaussian filter; a refit of them took a quarter of an hour. A
+    written-out model has them refitted."""
+    for made, called in ((model(), True), (trend(lambda x, v, a: (x + v, a * v)), False)):
+        problem = pose(made, {n: record(0.8, 1)[n] for n in ("y", *trace(made).inputs)})
+        t, missing = problem.trace, problem.program.missing
+        rng = np.random.default_rng(1)
+        states, y = rng.normal(size=(T, 4, 2)), problem.experiments[0].y
+        scales = Scales.of(t, states, y, rng.normal(size=(T, len(t.input_symbols))), T)
+        tried, _ = offers(t, scales, ["outliers", "sensor bias"])
+        augmented = AugmentedModels(t, missing, {}, Settings(100, "twisted"))
+        found = {str(c): only_by_particles(augmented, augmented.fitter([c])) for c in tried}
+        assert found.pop("outliers in v") == called
+        assert not any(found.values())
+        assert {"outliers in y", "sensor bias in y"} <= set(found)
+        if called:
+            outliers = [c for c in tried if str(c) == "outliers in v"]
+            refused = refit(augmented, None, None, [0], problem.experiments, None, outliers)
+            assert isinstance(refused, NotApplicable)
+            assert "outliers in v: only a particle filter" in refused.reason
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, fit_for_simulation, restored
 from ssmppl.errors import NotApplicable, SSMError
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
 
@@ -146,6 +147,11 @@ def refit(
     effort = effort_for(candidates, approximate)
     try:
         fitter = augmented.fitter(candidates)
+        if only_by_particles(augmented, fitter):
+            return NotApplicable(
+                f"{' and '.join(map(str, candidates))}: only a particle filter gives its "
+                "likelihood, and that would call the simulator for hours"
+            )
         if afresh:
             strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
             fit = fitter.fit(train, seed, strengths)
@@ -172,6 +178,13 @@ def refit(
             f"remaining gain {fit.distance:.0f} nats"
         )
     return Refit(tuple(index), candidates, fitter, fit, gain)
+
+
+def only_by_particles(augmented: AugmentedModels, fitter: Fitter) -> bool:
+    """Whether an effect, as outliers do, takes the Gaussian filter from a model that calls a
+    simulator."""
+    before, after = augmented.base_fitter.smoother.extended, fitter.smoother.extended
+    return isinstance(before, Extended) and not isinstance(after, Extended)
 
 
 def effort_for(candidates: Sequence[Candidate], approximate: bool = False) -> Effort:
