@@ -374,12 +374,23 @@ def which(report: Findings) -> list[str]:
         others = rivals(report, row)
         if others:
             names = listed([row_label(r) for r in others], "or")
-            rhos = [abs(float(r["rho"])) for r in others if is_number(r["rho"])]
-            close = f" (efficient scores correlated up to |rho| = {max(rhos):.2f})" if rhos else ""
-            out.append(sentence(f"not distinguishable by these data from {names}{close}"))
+            text = f"not distinguishable by these data from {names}{_closeness(report, others)}"
+            out.append(sentence(text))
         elif row.get("class_id") in [r["class_id"] for r in rows(report.classes)]:
             out.append("These data distinguish it from every other effect tried.")
     return out
+
+
+def _closeness(report: Findings, others: Sequence[dict[str, Any]]) -> str:
+    """What makes these one class with the effect before them: the gains of their refits, or how
+    much their scores correlate with its own."""
+    gains = {(r["effect"], r["equation"]): r.get("gain_refit") for r in rows(report.causes)}
+    own = [gains.get((r["effect"], r["equation"])) for r in others]
+    if all(is_number(g) for g in own):
+        they = "it gains" if len(own) == 1 else "they gain"
+        return f" (refitted, {they} {listed([number(g, 2) for g in own])} nats)"
+    rhos = [abs(float(r["rho"])) for r in others if is_number(r["rho"])]
+    return f" (efficient scores correlated up to |rho| = {max(rhos):.2f})" if rhos else ""
 
 
 def _curve_peak(report: Findings) -> str:

@@ -139,6 +139,15 @@ def test_of_many_rivals_some_are_named_and_the_rest_counted():
     ]
 
 
+def test_what_makes_effects_alike_is_told_by_the_gains_of_their_refits_or_by_their_scores():
+    """A rival whose score has little in common with the best one's can gain as much."""
+    report = effect_found()
+    assert "state-dependent damping in v (refitted, it gains 23 nats)." in " ".join(which(report))
+    report = dataclasses.replace(report, causes=report.causes.assign(gain_refit=NAN))
+    rho = float(report.classes["rho"].iloc[1])
+    assert f"(efficient scores correlated up to |rho| = {rho:.2f})." in " ".join(which(report))
+
+
 # -- the first line
 @pytest.mark.parametrize(
     ("name", "parts"),
