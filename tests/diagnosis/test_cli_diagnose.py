@@ -85,7 +85,7 @@ def test_everything_given_is_handed_on(calls, tmp_path):
     assert checkpoint.resolve().parent == tmp_path / "out"
     assert keywords == {"mode": "fast", "alpha": 0.01, "fixed": {"q": 0.5, "r": 1.0},
                         "particles": 500, "progress": True, "seed": 7, "debug": False,
-                        "horizon": 40}  # fmt: skip
+                        "horizon": 40, "executor": None}  # fmt: skip
 
 
 def test_the_words_are_printed_and_the_folder_is_written(calls, tmp_path):
