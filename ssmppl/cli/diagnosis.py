@@ -26,6 +26,7 @@ __all__ = ["diagnose"]
 
 # Beside the report: the stages that are done, from which an interrupted run goes on.
 CHECKPOINT = "stages"
+MOST_WORKERS = 8  # where none are asked for: each holds the package and its compiled code
 
 
 def _names(text: str | None) -> list[str] | None:
@@ -86,7 +87,7 @@ def _made(folder: Path) -> Path:
 @option(
     "--workers", type=click.IntRange(1), section="Run",
     help="Processes that share the simulated sets and refits [default: threads of this one; where "
-    "the model calls a simulator, as many processes as cores].",
+    "the model calls a simulator, as many processes as cores, 8 at most].",
 )  # fmt: skip
 @option(
     "--debug", is_flag=True, section="Run", show_default=False,
@@ -119,8 +120,8 @@ def diagnose(
     loaded, read = load_model(model), read_data(data)
     folder = _made(output or Path(f"{data[0].stem}_report"))
     kept = checkpoint or folder / CHECKPOINT
-    if workers is None:  # Python code holds the others up, compiled code does not
-        workers = cpu_count() if simulators(trace(loaded)) else 1
+    if workers is None:  # Python code holds other threads up, compiled code does not
+        workers = min(cpu_count(), MOST_WORKERS) if simulators(trace(loaded)) else 1
     try:
         with processes(workers) if workers > 1 else nullcontext() as executor:
             report: GapReport = ssm.diagnose(

@@ -337,6 +337,22 @@ def test_a_diagnosis_shares_simulators_over_processes(series, monkeypatch, model
             executor.submit(int)
 
 
+def test_of_many_cores_a_diagnosis_takes_some(series, monkeypatch):
+    """Each process holds the package and its compiled code."""
+    seen = []
+
+    def diagnose(*args, executor, **settings):
+        seen.append(workers_of(executor))
+        return dataclasses.replace(effect_found(), missing=None)
+
+    write("called.py", CALLED)
+    monkeypatch.setattr("ssmppl.cli.diagnosis.cpu_count", lambda: 64)
+    monkeypatch.setattr(ssm, "diagnose", diagnose, raising=False)
+    run("diagnose", "called.py", series, "-o", "out")
+    run("diagnose", "called.py", series, "--workers", 9, "-o", "out")
+    assert seen == [8, 9]
+
+
 def test_an_interrupted_evidence_says_what_it_is_made_of(series, monkeypatch):
     monkeypatch.setattr("ssmppl.inference.verbs.evidence.sample", interrupted_after(20))
     words = ("evidence", "walk.py", series, "--draws", 60, "--warmup", 30, "--seed", 1)

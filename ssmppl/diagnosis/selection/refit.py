@@ -150,7 +150,7 @@ def refit(
         if only_by_particles(augmented, fitter):
             return NotApplicable(
                 f"{' and '.join(map(str, candidates))}: only a particle filter gives its "
-                "likelihood, and that would call the simulator for hours"
+                "likelihood, and that would call the simulator for each of its particles"
             )
         if afresh:
             strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
@@ -305,7 +305,7 @@ def correlated_candidates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
 def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     """The other numbers of states, as delays are, of those near the best that have one, and the
     dates next to those that are dated: nothing between two of them can be estimated. Of a model
-    that calls a simulator no further dates: half a minute each for a nat or two."""
+    that calls a simulator no further dates, as each of its refits takes long."""
     called = bool(simulators(screen.design.trace))
     near = [r.index[0] for r in refits if refits[0].penalised_gain - r.penalised_gain <= NEAR]
     out: list[int] = []
