@@ -5,6 +5,7 @@ Every fault is one of the user's files or words, and is raised as an error that 
 
 from __future__ import annotations
 
+import csv
 import json
 import sys
 import traceback
@@ -15,6 +16,8 @@ from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ssmppl.data.times import as_dates
 from ssmppl.errors import ArgumentError, DataError, Location, ModelError, SSMError, listing
@@ -132,7 +135,8 @@ def read_csv(path: Path) -> pd.DataFrame:
     """A CSV file as a table; `time` labels the rows, or else a first column of dates or without a
     name.
 
-    Labels that are dates become dates. An empty cell is a missing value.
+    Labels that are dates become dates. An empty cell is a missing value; where there is one column
+    so is an empty line, except at the end.
 
     Raises
     ------
@@ -145,6 +149,8 @@ def read_csv(path: Path) -> pd.DataFrame:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(path, skipinitialspace=True, index_col=False)
+            if len(table.columns) == 1:
+                table = _with_empty_lines(table, path)
     except pd.errors.ParserWarning as error:  # pandas would leave out what has no name
         _check_first_line(path, names)
         raise DataError(
@@ -172,6 +178,26 @@ def read_csv(path: Path) -> pd.DataFrame:
             fix="rename or drop one of them",
         )
     return labelled(table)
+
+
+def _with_empty_lines(table: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """A table of one column with its missing rows that are empty lines, which pandas skips.
+
+    An empty line after each line, the first included, comes of line ends written twice, as
+    Python's `csv` does on Windows without `newline=""`: it is no row.
+    """
+    import pandas as pd
+
+    lines = pd.read_csv(
+        path, header=None, names=["line"], dtype=str, keep_default_na=False, na_values=[""],
+        skip_blank_lines=False, skipinitialspace=True, index_col=False, quoting=csv.QUOTE_NONE,
+    )["line"]  # fmt: skip
+    filled = lines.notna().to_numpy().nonzero()[0]
+    rows = filled[1:] - filled[0] - 1  # counted from the line after the names
+    doubled = len(rows) > 1 and (rows == 2 * np.arange(len(rows)) + 1).all()
+    if doubled or len(rows) != len(table):  # a cell that holds lines itself
+        return table
+    return table.set_axis(rows).reindex(range(rows[-1] + 1 if len(rows) else 0))
 
 
 def _check_first_line(path: Path, names: pd.Series) -> None:

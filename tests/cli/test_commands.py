@@ -369,6 +369,24 @@ def test_spaces_in_the_header(tmp_path):
     assert list(read_csv(path).columns) == ["time", "y"]
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("y\n1\n\n2\n\n\n", [1, np.nan, 2]),
+        ("\n\ny\n\n1\n  \n\n2", [np.nan, 1, np.nan, np.nan, 2]),
+        ('y\r\n1\r\n\r\n""\r\n2\r\n', [1, np.nan, np.nan, 2]),
+        ("y\n\n1\n\n2\n\n3\n", [1, 2, 3]),  # each line has ended twice
+        ("y\n", []),
+    ],
+)
+def test_empty_lines_of_one_column_are_missing_rows(tmp_path, text, expected):
+    path = tmp_path / "d.csv"
+    path.write_bytes(text.encode())
+    read = read_csv(path)
+    np.testing.assert_array_equal(read["y"].to_numpy(float), expected)
+    assert list(read.index) == list(range(len(expected)))
+
+
 # -- real processes
 def program(*args, **settings):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}
