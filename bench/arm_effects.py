@@ -92,7 +92,7 @@ def right(kind: str, report: Any) -> bool:
     if report.verdict != "effect" or not len(report.causes):
         return False
     best = report.causes.iloc[0]
-    where = ("u1", "u2") if kind == "delay" else ("v2",)
+    where = ("u1", "u2", "u1 and u2") if kind == "delay" else ("v2",)
     return best["effect"].startswith(names) and best["equation"] in where
 
 

@@ -54,6 +54,7 @@ class Candidate:
     held : its process is held at 1: see `increment`.
     reaction : (label, factor) of each equation that moves with its own, by so many times as much
         (`shared_terms`). carried : likewise of what integrates its new value.
+    alike : labels of further inputs in which the same happens, with the same strength.
     force : the argument of a simulator through which it acts, in whose unit its strength is; "" for
         an increment of the equation itself.
     shares : candidates of the same text here have the same shapes, which then are one parameter.
@@ -70,6 +71,7 @@ class Candidate:
     reaction: tuple[tuple[str, Expr], ...] = ()
     carried: tuple[tuple[str, Expr], ...] = ()
     force: str = ""
+    alike: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:
@@ -93,7 +95,17 @@ class Candidate:
         own = [self.effect.name, self.form]
         if self.held:
             own = [self.effect.constant, ""] if self.effect.constant else [*own, "held"]
-        return " | ".join([*own, self.change, self.equation])
+        return " | ".join([*own, self.change, self.place])
+
+    @property
+    def place(self) -> str:
+        """The equation, or all inputs in which it acts: "u1 and u2"."""
+        return " and ".join([self.equation, *self.alike])
+
+    @property
+    def each(self) -> list[Candidate]:
+        """The same in each of the inputs in which it happens, its own first."""
+        return [replace(self, equation=label, alike=()) for label in (self.equation, *self.alike)]
 
     @property
     def key(self) -> str:
@@ -166,7 +178,7 @@ class Candidate:
     def __str__(self) -> str:
         form = f" ({self.form})" if self.form else ""
         shape = ", ".join(f"{n} = {shape_text(v)}" for n, v in self.shape)
-        return f"{self.effect.name}{form} in {self.equation}" + (f" with {shape}" if shape else "")
+        return f"{self.effect.name}{form} in {self.place}" + (f" with {shape}" if shape else "")
 
 
 def shape_text(value: float | Expr) -> str:

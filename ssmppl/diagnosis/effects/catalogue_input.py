@@ -55,7 +55,7 @@ def backlash(u, held, strength, c):
 
 
 @effect(on="input", kind="state", name="input delay", lower=0, upper=2, states={"past": "delay"},
-        shapes={"delay": numbers(1, 2, 4)})  # fmt: skip
+        shapes={"delay": numbers(1, 2, 4)}, common=True)  # fmt: skip
 def input_delay(u, past, strength, delay):
     """u_t + l (u_{t - delay} - u_t)"""
     newest_first = np.stack([u, *past[:-1]])
@@ -64,7 +64,7 @@ def input_delay(u, past, strength, delay):
 
 
 @effect(on="input", kind="state", name="actuator lag", lower=0, upper=2, states=("lagged",),
-        shapes={"k": numbers(2, 5, 15, between=(1.0, 60.0))})  # fmt: skip
+        shapes={"k": numbers(2, 5, 15, between=(1.0, 60.0))}, common=True)  # fmt: skip
 def actuator_lag(u, lagged, strength, k):
     """u + l (w - u), w following u with the time constant of k rows"""
     follows = lagged + (u - lagged) / k

@@ -23,6 +23,8 @@ from ssmppl.diagnosis.effects.effect import (
 from ssmppl.language.distributions import Dirac, Normal
 
 POSITION, OTHER, LOAD = {"x": "position"}, {"other": "other state"}, {"u": "any input"}
+# What meets a stiff stop within a step is never seen beyond it: where it would come to counts.
+AHEAD = {"x": "ahead"}
 
 
 # -- friction
@@ -85,14 +87,14 @@ def state_dependent_damping(v, x, strength):
     return -strength * x**2 * v
 
 
-@effect(on="rate", name="hard stop", form="upper", lower=0, given=POSITION,
+@effect(on="rate", name="hard stop", form="upper", lower=0, given=AHEAD,
         shapes={"h": quantiles(0.6, 0.8, 0.95, of="x", between=(0.5, 0.99))})  # fmt: skip
 def upper_stop(v, x, strength, h):
     """-l max(x - h, 0)"""
     return -strength * np.maximum(x - h, 0.0)
 
 
-@effect(on="rate", name="hard stop", form="lower", lower=0, given=POSITION,
+@effect(on="rate", name="hard stop", form="lower", lower=0, given=AHEAD,
         shapes={"h": quantiles(0.4, 0.2, 0.05, of="x", between=(0.01, 0.5))})  # fmt: skip
 def lower_stop(v, x, strength, h):
     """l max(h - x, 0)"""
@@ -104,7 +106,7 @@ def lower_stop(v, x, strength, h):
     name="hard stop",
     form="both ends",
     lower=0,
-    given=POSITION,
+    given=AHEAD,
     shapes={"h": sds(1.0, 1.5, of="x", between=(0.3, 2.5)), "middle": means(1.0, of="x")},
 )
 def both_stops(v, x, strength, h, middle):

@@ -42,6 +42,8 @@ a name or label     that one: "v", "x[0]"
 ==================  ===========================================================================
 "position"          the state that integrates the one it is bound to; where none does, that itself
 "integral"          likewise; not offered where none does
+"ahead"             "position", at the end of the step where that depends on no parameter, or comes
+                    from a simulator
 "moved"             how far that one moves in the step
 "other state"       another state: one candidate for each
 "any input"         an input: one candidate for each
@@ -71,7 +73,16 @@ Bounds = tuple[float, float] | None
 
 # The words of a declaration: see the tables above.
 KINDS = ("transition", "observation", "input", "noise", "tail", "parameter", "initial", "state")
-GIVEN = ("position", "integral", "moved", "other state", "any input", "second order", "profile")
+GIVEN = (
+    "position",
+    "integral",
+    "ahead",
+    "moved",
+    "other state",
+    "any input",
+    "second order",
+    "profile",
+)
 ON = ("any", "rate", "state", "channel", "input", "parameter", "positive parameter",
       "other parameter")  # fmt: skip
 REQUIRES = ("positive", "both signs")
@@ -202,6 +213,8 @@ class Effect:
         is a constant for one that never changes its sign.
     afresh : the strength with which the model is fitted anew from its own start where the variable
         keeps one sign, None for no such fit: its fit may lie where the effect is nothing.
+    common : whether it is offered for all inputs at once, too, with one strength: what delays the
+        way from a computer delays every input.
     note : the formula or what it stands for, in words.
     """
 
@@ -220,6 +233,7 @@ class Effect:
     constant: str = ""
     requires: str = ""
     afresh: float | None = None
+    common: bool = False
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -292,6 +306,7 @@ def effect(
     constant: str = "",
     requires: str = "",
     afresh: float | None = None,
+    common: bool = False,
     note: str = "",
 ) -> Any:
     """Declare an unmodelled effect that `diagnose` shall look for.
@@ -304,7 +319,7 @@ def effect(
     kind : what the function changes; see the tables of this module.
     form : tells this effect from others of the same name.
     lower, upper : bounds of the strength. `lower` alone must be 0.
-    shapes, given, states, profile, process, constant, requires, afresh, note : see
+    shapes, given, states, profile, process, constant, requires, afresh, common, note : see
         `Effect`.
 
     Returns
@@ -350,6 +365,7 @@ def effect(
             constant=constant,
             requires=requires,
             afresh=afresh,
+            common=common,
             note=note or doc,
         )
 
@@ -382,6 +398,11 @@ def _faults(e: Effect) -> Iterator[tuple[str, str]]:
         )
     if e.kind not in KINDS:
         yield (f"its kind is {e.kind!r}", f"use one of: {listing(str(e.kind), KINDS)}")
+    if e.common and e.on != "input":
+        yield (
+            f"common={e.common!r}, and it is offered on {e.on!r}",
+            'give on="input", or leave common out',
+        )
     if any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values()):
         yield ("it takes *arguments", "name each argument: they are bound by name")
     if not isinstance(e.on, str) or not e.on:

@@ -135,7 +135,7 @@ def separate(
     nats, within = search.recorded(experiments)
     if math.isnan(nats):
         return None
-    effects = tuple((r.candidates[0].effect.name, r.candidates[0].equation) for r in rivals)
+    effects = tuple((r.candidates[0].effect.name, r.candidates[0].place) for r in rivals)
     found = Separation(effects, members, max(nats, 0.0), longest.u, len(experiments))
     if found.as_recorded:
         return found

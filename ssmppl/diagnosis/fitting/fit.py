@@ -82,17 +82,20 @@ class Effort:
     and take the information there; else climb to within what a decision needs, and there is none
     (NaN). All other fits have the one that their climb has used or built up, either way.
     approximate : the top of the extended Kalman filter's likelihood will do, where there is one,
-    for what is fitted many times.
+    for what is fitted many times. levels : from how many levels of the process noise it is climbed,
+    the largest that of the start.
     """
 
     pilot: bool = True
     standard_errors: bool = True
     approximate: bool = False
+    levels: int = len(NOISE_SHARES)
 
 
 FROM_START = Effort(pilot=False)
 WITHOUT_ERRORS = Effort(pilot=False, standard_errors=False)
-APPROXIMATELY = Effort(pilot=False, standard_errors=False, approximate=True)
+APPROXIMATELY = Effort(pilot=False, standard_errors=False, approximate=True, levels=1)
+FROM_NEARBY = Effort(pilot=False, standard_errors=False, levels=1)
 
 
 @dataclass(frozen=True)
@@ -272,7 +275,7 @@ class Fitter:
             space = at(space, space.parameters(z)[0].copy())
         if smooth is None:
             return self._fit_by_particles(space, seed, information)
-        shares = NOISE_SHARES[: 1 if effort.approximate else None]
+        shares = NOISE_SHARES[: effort.levels]
         space, top = self._top_of_extended_filter(space, smooth, seed, shares)
         if top is not None:
             information = positive_definite(top.information, ~space.on_the_line)

@@ -15,7 +15,7 @@ import numpy as np
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
-from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, WITHOUT_ERRORS, Fit, Fitter
+from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, FROM_NEARBY, Fit, Fitter
 from ssmppl.diagnosis.heldout.predictions import predict
 from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.model.augment import augment, with_given_parameters
@@ -90,7 +90,7 @@ def fit_reference(
         fitter, begin = superset(augmented, chosen, start, groups[:count])
 
         def numbers(fitter: Fitter = fitter, begin: Values = begin) -> Numbers:
-            effort = APPROXIMATELY if split is None else WITHOUT_ERRORS
+            effort = APPROXIMATELY if split is None else FROM_NEARBY
             return fitter.fit(train, seed, begin, effort).numbers
 
         stage = "reference" if count == len(groups) else "reference with one group"
@@ -110,7 +110,7 @@ def _gained(
     for wanted in ([], groups):
         fitter, begin = superset(augmented, chosen, start, wanted)
         try:
-            fit = fitter.fit(split.reference_train, seed, begin, WITHOUT_ERRORS)
+            fit = fitter.fit(split.reference_train, seed, begin, FROM_NEARBY)
             found = predict(fitter, fit, split.train, split.reference_validation, seed)
         except SSMError:
             return np.asarray(-np.inf)

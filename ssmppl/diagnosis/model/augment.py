@@ -72,11 +72,12 @@ def augment(
     late = [c for c in every if c.change not in ("input", "parameter")]
     names: dict[str, dict[str, str]] = {}  # strength -> its auxiliary states
     for c in early:
-        names[c.strength] = auxiliary.add(c, equations, locations)
+        for one in c.each:
+            names[_key(c, one)] = auxiliary.add(one, _key(c, one), equations, locations)
     new = _replaced(origin, early, equations, names, locations)
     equations = Equations(new, equations)
     for c in late:
-        names[c.strength] = auxiliary.add(c, equations, locations)
+        names[c.strength] = auxiliary.add(c, c.strength, equations, locations)
     forced = [c for c in late if c.force]
     pushes = _pushes(forced, equations, names, locations)
     inside, rest = pushes, []
@@ -126,6 +127,11 @@ def with_given_parameters(
     return replace(trace, parameters=parameters)
 
 
+def _key(c: Candidate, one: Candidate) -> str:
+    """By which the auxiliary states of `one` of the inputs are kept in which a candidate acts."""
+    return c.strength if one.equation == c.equation else f"{c.strength} in {one.equation}"
+
+
 def _in_order(before: Mapping[str, Site], new: dict[str, Site]) -> dict[str, Site]:
     """The sites with those that there were before first, in their order."""
     return {n: new[n] for n in [*before, *(n for n in new if n not in before)]}
@@ -142,7 +148,7 @@ def _check(candidates: Sequence[Candidate], trace: Trace, equations: Equations) 
             )
         taken[c.strength] = f"the strength of {c}"
         moved = [label for label, _ in (*c.reaction, *c.carried)]
-        for label in (c.equation, *dict(c.bound).values(), *moved):
+        for label in (c.equation, *c.alike, *dict(c.bound).values(), *moved):
             if label not in equations.parts:
                 raise ArgumentError(
                     f"{c}: the model {equations.trace.name!r} has no {label!r}",
@@ -189,18 +195,18 @@ class _Auxiliary:
         self.transition: dict[str, Site] = {}
 
     def add(
-        self, c: Candidate, equations: Equations, locations: dict[Expr, Location]
+        self, c: Candidate, key: str, equations: Equations, locations: dict[Expr, Location]
     ) -> dict[str, str]:
         """The names of a candidate's states: those of an earlier one where their distributions
-        agree."""
+        agree. key : by which `earlier` has them."""
         if not c.effect.states or c.held:
             return {}
         for number in itertools.count(1):
             suffix = "" if number == 1 else f"_{number}"
             names = {n: slug(f"{n} {c.equation}") + suffix for n in c.effect.states}
-            names = self.earlier.get(c.strength, names)
+            names = self.earlier.get(key, names)
             # A name that an earlier candidate keeps is not given away before it is asked for.
-            kept = self.kept if c.strength not in self.earlier else set()
+            kept = self.kept if key not in self.earlier else set()
             if (self.taken | kept - set(self.initial)) & set(names.values()):
                 continue
             with attributed(locations, c.effect.where):
@@ -243,9 +249,10 @@ def _replaced(
     for role in ("transition", "observation"):
         values: dict[Expr, list[Expr]] = defaultdict(list)
         for c in candidates:
-            with attributed(locations, c.effect.where):
-                changes = bind(c, equations, role, names[c.strength]).changes
-            values[equations.parts[c.equation].seen_from(role)] += changes.values()
+            for one in c.each:
+                with attributed(locations, c.effect.where):
+                    changes = bind(one, equations, role, names[_key(c, one)]).changes
+                values[equations.parts[one.equation].seen_from(role)] += changes.values()
         replacement = {}
         for s, new in values.items():
             total = new[0]

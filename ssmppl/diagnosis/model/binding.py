@@ -245,7 +245,13 @@ def _given(
     if name not in bound:
         raise _refuse(effect, f"nothing is bound to {name!r}, which is to be {what!r}",
                       "make its candidates by offers()")  # fmt: skip
-    return equations.parts[bound[name]].seen_from(role)
+    value = equations.parts[bound[name]].seen_from(role)
+    if what == "ahead" and bound[name] != part.label:
+        step = _value(equations.step(equations.parts[bound[name]]), effect)
+        # A jump in what depends on parameters would leave these without a derivative.
+        if equations.force(part) or all(s.data[0] != "parameter" for s in symbols_of([step])):
+            value = value + step
+    return value
 
 
 def check_base(candidate: Candidate, equations: Equations, bound: Bound, role: str) -> None:

@@ -133,6 +133,7 @@ def _of_effect(
     parts = _parts(effect, equations)
     if not parts:
         refuse("", f"the model has no {_wanted(effect)}")
+    single: dict[str, list[Candidate]] = {}  # by input, of an effect that may be common to all
     for part in parts:
         reason = _reason(effect, part, equations, scales)
         if reason:
@@ -158,12 +159,17 @@ def _of_effect(
                 refuse(part.label, reason)
                 continue
             out += made
+            if effect.common:
+                single.setdefault(part.label, made)
             alone = moves and len(bind(made[0], equations, "transition", own=True).changes) == 1
             if effect.on in ("rate", "state") and alone:
                 for reaction in shared.reactions.get(part.label, []):
                     acting = [replace(c, reaction=reaction) for c in made]
                     if not _check(acting[0], equations):
                         out += acting
+    if len(single) > 1:
+        first, *others = single
+        out += [replace(c, alike=tuple(others)) for c in single[first]]
     return out, refused
 
 
@@ -278,7 +284,11 @@ def _options(what: str, part: Part, equations: Equations) -> list[str] | str:
         return labels or "the model has no input"
     position = equations.position(part)
     if position is None:
-        return [part.label] if what == "position" else f"no state is the integral of {part.label}"
+        return (
+            [part.label]
+            if what in ("position", "ahead")
+            else f"no state is the integral of {part.label}"
+        )
     return [position.label]
 
 
@@ -339,7 +349,7 @@ def _named(candidates: Sequence[Candidate], equations: Equations) -> list[Candid
     taken = {p.name for p in equations.parts.values()} | set(RESERVED) | {"np", "ssm", "model"}
     out = []
     for c in candidates:
-        plain = slug(f"{c.effect.name} {c.equation}")
+        plain = slug(f"{c.effect.name} {c.place}")
         name = next(n for n in _numbered(plain) if n not in taken)
         taken.add(name)
         out.append(replace(c, strength=name))

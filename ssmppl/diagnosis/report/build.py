@@ -156,7 +156,7 @@ def _attributes(
         c = refitted.get(k, r.screen.design.candidates[k])
         found = attribute_of(r.trace, c, float(strengths[i]))
         if found:
-            out[f"{c.effect.name} in {c.equation}"] = found
+            out[f"{c.effect.name} in {c.place}"] = found
     return out
 
 

@@ -20,12 +20,15 @@ def attribute_of(trace: Trace, c: Candidate, strength: float) -> str:
     """
     if not math.isfinite(strength) or strength == 0.0:
         return ""
-    for simulator, argument in _arguments(trace, c):
-        told = getattr(simulator.step, "attribute_of", None)
-        numbers = {n: float(v) for n, v in c.shape if not isinstance(v, Expr)}
-        if callable(told) and (found := told(c.effect.name, argument, strength, numbers)):
-            return str(found)
-    return ""
+    out: list[str] = []
+    numbers = {n: float(v) for n, v in c.shape if not isinstance(v, Expr)}
+    for one in c.each:
+        for simulator, argument in _arguments(trace, one):
+            told = getattr(simulator.step, "attribute_of", None)
+            if callable(told) and (found := told(c.effect.name, argument, strength, numbers)):
+                out.append(str(found))
+                break
+    return ", ".join(out)
 
 
 def _arguments(trace: Trace, c: Candidate) -> list[tuple[Any, str]]:

@@ -218,9 +218,11 @@ class _Writer:
         for strength, c in self.added.items():
             symbol = Expr("symbol", (), ("parameter", strength, ()))
             if c.change in ("input", "parameter"):
-                own = (strength, c.equation.split("[")[0], "t",
-                       *(slug(f"{n} {c.equation}") for n in c.effect.states))  # fmt: skip
-                nodes = parts_of(roots, symbol, lambda n, own=own: n.startswith(own))  # type: ignore[misc]
+                nodes = []
+                for one in c.each:
+                    own = (strength, one.equation.split("[")[0], "t",
+                           *(slug(f"{n} {one.equation}") for n in c.effect.states))  # fmt: skip
+                    nodes += parts_of(roots, symbol, lambda n, own=own: n.startswith(own))  # type: ignore[misc]
             else:
                 nodes = terms_with(roots, symbol)
             for node in nodes:

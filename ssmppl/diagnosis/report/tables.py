@@ -184,7 +184,7 @@ def causes_table(
         if screen_is_current:
             p = min(float(significant[k]), tested.get(k, 1.0))
         rows.append({
-            "effect": c.effect.name, "equation": c.equation, "kind": c.effect.cause,
+            "effect": c.effect.name, "equation": c.place, "kind": c.effect.cause,
             "z": float(s.z[k]),
             "p": float(np.minimum(1.0, tests * p)),
             "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
@@ -240,7 +240,7 @@ def classes_table(
         for m in members:
             c = screen.design.candidates[order[m]]
             rows.append({
-                "class_id": int(number), "effect": c.effect.name, "equation": c.equation,
+                "class_id": int(number), "effect": c.effect.name, "equation": c.place,
                 "rho": float(found.rho[m]),
                 "separating_input": best.signal.words if best and number == FIRST else "",
             })  # fmt: skip

@@ -35,6 +35,7 @@ class Choice(IntEnum):
     CHOSEN_SHAPES = 8
     SIMULATION = 9  # predictions further ahead of the model as it is
     EXPLAINED = 10  # whether a cause explains what gained more
+    OVERLOOKED = 11  # mechanisms that a screen at a strength of zero does not see
 
 
 class Task(IntEnum):

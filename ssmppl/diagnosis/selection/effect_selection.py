@@ -25,6 +25,7 @@ from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.horizons import SimulationGain
+from ssmppl.diagnosis.selection.overlooked import best_start, overlooked
 from ssmppl.diagnosis.selection.refit import (
     EXPLAINED,
     Refit,
@@ -164,7 +165,22 @@ class EffectSelection:
                 )  # fmt: skip
                 refits = best_of_groups(screen, refits + more)
                 out.notes += [f"not refitted: {reason}" for reason in failed]
+        with self.checkpoint.failures.guard("mechanisms that the screen overlooks"):
+            refits = best_of_groups(screen, refits + self._overlooked(out, refits))
         out.refits = refits
+
+    def _overlooked(self, out: SelectionResult, refits: Sequence[Refit]) -> list[Refit]:
+        """Mechanisms where what only describes a misfit gains most."""
+        seed, stage = self._seed(Choice.OVERLOOKED), "refitting mechanisms of that equation"
+        shapes = overlooked(self.screen, refits, critical_gain(self.screen, self.alpha))
+        one = partial(best_start, self.augmented, out.base, self.screen, shapes, tuple(self.train))
+        starts = self.checkpoint.map("looking for mechanisms of that equation", len(shapes), one)
+        found = [n for n in starts if "column" in n]
+        more, _ = self._refit(
+            out, out.base, self.screen, [[int(n["column"])] for n in found], seed, stage,
+            strengths=[float(n["strength"]) for n in found],
+        )  # fmt: skip
+        return more
 
     def _simulation(self, base: Fit) -> tuple[SimulationGain, SimulationFit]:
         fitter = self.augmented.base_fitter
@@ -175,10 +191,12 @@ class EffectSelection:
         self, out: SelectionResult, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
         seed: np.random.SeedSequence, stage: str, given: Sequence[Candidate] = (), *,
         checkpoint: Checkpoint | None = None, afresh: bool = False,
+        strengths: Sequence[float] | None = None,
     ) -> tuple[list[Refit], list[str]]:  # fmt: skip
         return refit_all(
             self.augmented, base, screen, sets, self.train, seed, checkpoint or self.checkpoint,
             stage, given, afresh=afresh, approximate=self.approximate, simulation=out.simulation,
+            strengths=strengths,
         )  # fmt: skip
 
     def _shaped(

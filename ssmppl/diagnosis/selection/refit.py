@@ -135,11 +135,12 @@ class Refit:
 def refit(
     augmented: AugmentedModels, base: Fit, screen: Screen, index: Sequence[int],
     train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
-    afresh: bool = False, approximate: bool = False,
+    afresh: bool = False, approximate: bool = False, strength: float | None = None,
 ) -> Refit | NotApplicable:  # fmt: skip
     """Fit the model with the effects of `candidates`, of which the last are the screen's at
     `index`, and the others are in `base`.
 
+    strength : of a single effect, from which the fit starts; None: what the screen's score says.
     afresh : from the model's own start, with the strengths that the effects declare for that.
     approximate : as of `Effort`.
     """
@@ -155,6 +156,9 @@ def refit(
         if afresh:
             strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
             fit = fitter.fit(train, seed, strengths)
+        elif strength is not None:
+            start = base.by_parameter | {candidates[-1].strength: np.asarray(strength)}
+            fit = fitter.fit(train, seed, start, effort)
         else:
             start = start_at(base, screen.design, screen.efficient, index)
             new = [c.strength for c in candidates[-len(index) :]]
@@ -393,15 +397,16 @@ def refit_all(
     augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str,
     given: Sequence[Candidate] = (), *, afresh: bool = False, approximate: bool = False,
-    simulation: SimulationGain | None = None,
+    simulation: SimulationGain | None = None, strengths: Sequence[float] | None = None,
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
-    """The refits that came to an end, best first, and why the others did not. afresh, approximate :
-    as of `refit`. simulation : of the model as it is, for `Refit.ahead`; None: that is 0."""
+    """The refits that came to an end, best first, and why the others did not. afresh, approximate,
+    strengths (one for each set) : as of `refit`. simulation : of the model as it is, for
+    `Refit.ahead`; None: that is 0."""
     shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
     one = partial(_one, augmented, base, screen, list(sets), tuple(train), seed, added, afresh,
-                  approximate, simulation)  # fmt: skip
+                  approximate, simulation, strengths)  # fmt: skip
     done, reasons = [], []
     results = checkpoint.map(stage, len(sets), one)
     for index, candidates, numbers in zip(sets, added, results, strict=True):
@@ -431,11 +436,14 @@ def _one(
     augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
     added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool,
-    simulation: SimulationGain | None, k: int,
+    simulation: SimulationGain | None, strengths: Sequence[float] | None, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
     own = child_seed(seed, Task.REFIT, k)
-    found = refit(augmented, base, screen, sets[k], train, own, added[k], afresh, approximate)
+    strength = None if strengths is None else strengths[k]
+    found = refit(
+        augmented, base, screen, sets[k], train, own, added[k], afresh, approximate, strength
+    )
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}
     if simulation is None:

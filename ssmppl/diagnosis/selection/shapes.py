@@ -3,12 +3,14 @@
 The screen tries a few values of each shape, which is enough to see an effect, and too few to
 predict with it: a period that is off by a quarter of a turn over the record is out of step
 afterwards. So the leading refits are fitted once more with their shapes as parameters, each between
-bounds that the effect declares.
+bounds that the effect declares; whole numbers, as those of the rows of a delay, are tried one by
+one from the best on, in the direction that gains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -31,6 +33,7 @@ SHAPED_CALLED = 2  # likewise, of a model that calls a simulator
 WITHIN, SHARE = 15.0, 0.4  # so many nats behind the best, or with so much of what it gains
 PRICE = 1.0  # nats that a shape has to gain: one for a parameter (Akaike 1974)
 INSIDE = 0.02  # share of the range from either bound where a fit starts
+FURTHEST = 4.0  # of the largest whole number that a screen tries
 
 
 def shape_bounds(c: Candidate, scales: Scales) -> dict[str, tuple[float, float]]:
@@ -54,6 +57,12 @@ def shape_bounds(c: Candidate, scales: Scales) -> dict[str, tuple[float, float]]
     return out
 
 
+def lengths(c: Candidate) -> dict[str, int]:
+    """Its shapes that are whole numbers: of an auxiliary state's components."""
+    names = [n for n in c.effect.states.values() if n is not None]
+    return {n: int(dict(c.shape)[n]) for n in names} if not c.held else {}
+
+
 def shaped_all(
     augmented: AugmentedModels, base: Fit, scales: Scales, refits: Sequence[Refit],
     train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str,
@@ -69,7 +78,7 @@ def shaped_all(
     least = min(best - WITHIN, SHARE * best)
     tried = [
         i for i, r in enumerate(out)
-        if r.score >= least and any(shape_bounds(c, scales) for c in r.candidates)
+        if r.score >= least and any(shape_bounds(c, scales) or lengths(c) for c in r.candidates)
     ][: SHAPED_CALLED if simulators(augmented.trace) else SHAPED]  # fmt: skip
 
     one = partial(_one, augmented, scales, [out[i] for i in tried], tuple(train), seed, simulation)
@@ -78,10 +87,11 @@ def shaped_all(
         checkpoint.failures.record_task(f"the shapes of {name}", numbers)
         if "shapes" in numbers:
             old, shapes = out[i], numbers["shapes"]
-            made = _reshaped(old.candidates, scales, shapes)
+            made = _reshaped(old.candidates, scales, shapes, numbers["lengths"])
             fitter = augmented.fitter(made)
             fit = fitter.restored(train, numbers)
-            cost = old.cost + PRICE * len(shapes)
+            moved = sum(a != b for a, b in zip(old.candidates, made, strict=True) if lengths(a))
+            cost = old.cost + PRICE * (len(shapes) + moved)
             gain = fit.log_likelihood - base.log_likelihood
             new = Refit(old.index, made, fitter, fit, gain, cost)
             new = new.simulated(train, numbers, simulation)
@@ -95,12 +105,54 @@ def _one(
     train: Sequence[Experiment], seed: np.random.SeedSequence, simulation: SimulationGain | None,
     k: int,
 ) -> Numbers:  # fmt: skip
-    found = _shaped(augmented, scales, refits[k], train, child_seed(seed, k))
-    if "shapes" not in found or simulation is None:
+    r = _with_lengths(augmented, refits[k], train, child_seed(seed, k))
+    found = _shaped(augmented, scales, r, train, child_seed(seed, k))
+    if not found and r is not refits[k]:
+        found = {**r.fit.numbers, "shapes": np.empty(0)}
+    if not found:
         return found
-    fitter = augmented.fitter(_reshaped(refits[k].candidates, scales, found["shapes"]))
+    found["lengths"] = _whole(r.candidates)
+    if simulation is None:
+        return found
+    made = _reshaped(refits[k].candidates, scales, found["shapes"], found["lengths"])
+    fitter = augmented.fitter(made)
     fit = fitter.restored(train, found)
     return {**found, **fit_for_simulation(fitter, fit, train, simulation).numbers}
+
+
+def _with_lengths(
+    augmented: AugmentedModels, r: Refit, train: Sequence[Experiment], seed: np.random.SeedSequence
+) -> Refit:
+    """The refit with the whole numbers that fit best, one after the other up or down by one for as
+    long as that gains."""
+    for i, c in enumerate(r.candidates):
+        for name in lengths(c):
+            most = FURTHEST * max(c.effect.shapes[name].values)
+            for step in (1, -1):
+                moved = False
+                while 1 <= (value := dict(r.candidates[i].shape)[name] + step) <= most:
+                    new = _refitted(augmented, r, i, {name: value}, train, seed)
+                    if new is None or new.gain <= r.gain:
+                        break
+                    r, moved = new, True
+                if moved:
+                    break
+    return r
+
+
+def _refitted(
+    augmented: AugmentedModels, r: Refit, i: int, shape: dict[str, float],
+    train: Sequence[Experiment], seed: np.random.SeedSequence,
+) -> Refit | None:  # fmt: skip
+    """The refit with another shape of its effect i, from where it ended; None where it fails."""
+    candidates = (*r.candidates[:i], r.candidates[i].with_shape(**shape), *r.candidates[i + 1 :])
+    try:
+        fitter = augmented.fitter(candidates)
+        fit = fitter.fit(train, seed, r.fit.by_parameter, effort_for(candidates))
+    except SSMError:
+        return None
+    gain = r.gain + fit.log_likelihood - r.fit.log_likelihood
+    return replace(r, candidates=candidates, fitter=fitter, fit=fit, gain=gain)
 
 
 def _shaped(
@@ -110,6 +162,8 @@ def _shaped(
     """The values of the shapes, in order, and the fit with them; empty where there is none, or one
     of them runs to its bound."""
     known = _bounded(r, scales)
+    if not known:
+        return {}
     start = {n: v for n, v in r.fit.by_parameter.items() if n not in known}
     for name, (low, high, value) in known.items():
         share = (value - low) / (high - low)
@@ -128,7 +182,7 @@ def _shaped(
     shapes = np.array(
         [a + (b - a) * s for (a, b, _), s in zip(known.values(), shares, strict=True)]
     )
-    plain = augmented.fitter(_reshaped(r.candidates, scales, shapes))
+    plain = augmented.fitter(_reshaped(r.candidates, scales, shapes, _whole(r.candidates)))
     own = {repr(s): s.data[1] for s in plain.problem.trace.parameter_symbols}
     theta = [values[text] if text in values else float(plain.fixed[name])
              for text, name in own.items()]  # fmt: skip
@@ -148,13 +202,19 @@ def _bounded(r: Refit, scales: Scales) -> dict[str, tuple[float, float, float]]:
     }
 
 
+def _whole(candidates: Sequence[Candidate]) -> np.ndarray:
+    """The whole numbers of all candidates, in order."""
+    return np.array([v for c in candidates for v in lengths(c).values()], dtype=float)
+
+
 def _reshaped(
-    candidates: Sequence[Candidate], scales: Scales, shapes: np.ndarray
+    candidates: Sequence[Candidate], scales: Scales, shapes: np.ndarray, whole: np.ndarray
 ) -> tuple[Candidate, ...]:
-    """The candidates with these values of all shapes that can be estimated."""
-    rest = list(map(float, shapes))
+    """The candidates with these values of all shapes that can be estimated, and whole numbers."""
+    rest, counts = list(map(float, shapes)), list(map(float, whole))
     out = []
     for c in candidates:
         own = {name: rest.pop(0) for name in shape_bounds(c, scales)}
+        own |= {name: counts.pop(0) for name in lengths(c)}
         out.append(c.with_shape(**own) if own else c)
     return tuple(out)

@@ -96,6 +96,7 @@ def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> lis
     """Names of effects, with their equations where one of that name is offered for several."""
     places: dict[str, set[str]] = {}
     for c in (*offered, *candidates):
-        places.setdefault(c.effect.name, set()).add(c.equation)
+        places.setdefault(c.effect.name, set()).add(c.place)
     return [c.effect.name if len(places[c.effect.name]) == 1
-            else f"{c.effect.name} on {c.equation}" for c in candidates]  # fmt: skip
+            else f"{c.effect.name} on {c.place}"
+            for c in candidates]  # fmt: skip
