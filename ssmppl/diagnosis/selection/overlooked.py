@@ -9,6 +9,7 @@ the best of a few strengths and shapes.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -99,7 +100,9 @@ def best_start(
                 for strength in sign * _strengths(screen, k):
                     start = base.by_parameter | {c.strength: np.asarray(strength)}
                     theta = space_of(fitter.problem, fitter.fixed, start).theta
-                    value = fitter.value(train, theta)
+                    with warnings.catch_warnings():  # of a simulator that is pushed too hard
+                        warnings.simplefilter("ignore")
+                        value = fitter.value(train, theta)
                     if value > best:
                         best, out = value, {"column": np.array(k), "strength": np.array(strength)}
                     if not value > level - HOPELESS:

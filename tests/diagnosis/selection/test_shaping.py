@@ -168,6 +168,37 @@ def test_an_estimate_that_runs_to_its_bound_is_none(forced, monkeypatch):
         assert (new is found) == kept
 
 
+# -- whole numbers
+@pytest.fixture(scope="module")
+def delayed():
+    """An input that comes three rows late."""
+    u = models.inputs_of("oscillator", ROWS)["u"]
+    return setting(np.r_[[u[0]] * 3, u[:-3]] - u)
+
+
+@pytest.mark.parametrize(("rows", "price"), [(1, PRICE), (5, PRICE), (3, 0.0)])
+def test_a_delay_is_counted_row_by_row(delayed, rows, price):
+    augmented, experiments, base = delayed
+    c = candidate("input delay", equation="u").with_shape(delay=rows)
+    found = refitted(augmented, base, c, experiments, 0.5)
+    (new,) = shapes_of((augmented, experiments, base, found))
+    assert dict(new.candidates[0].shape)["delay"] == 3
+    assert new.cost - found.cost == price
+    assert new.strengths == pytest.approx([1.0], abs=0.1)
+    assert new.fit.log_likelihood == pytest.approx(
+        new.fitter.kalman.log_likelihood(experiments, new.fit.theta), abs=1e-8
+    )
+
+
+def test_no_delay_is_longer_than_four_times_what_the_screen_tries(delayed, monkeypatch):
+    augmented, experiments, base = delayed
+    c = candidate("input delay", equation="u").with_shape(delay=2)
+    found = refitted(augmented, base, c, experiments, 0.5)
+    monkeypatch.setattr(shapes, "FURTHEST", 0.5)  # of four rows
+    (new,) = shapes_of((augmented, experiments, base, found))
+    assert dict(new.candidates[0].shape)["delay"] == 2
+
+
 def test_a_width_does_not_shrink_to_nothing():
     t = traced("gap", "oscillator")
     c = candidate("dead zone", equation="u")

@@ -1,0 +1,156 @@
+"""Mechanisms that a score at a strength of zero does not see, tried at finite strengths."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
+from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
+from ssmppl.diagnosis.selection import overlooked as module
+from ssmppl.diagnosis.selection.overlooked import best_start, overlooked
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
+from tests.statistics.checks import seed_of
+
+EFFECTS = ["hard stop", "quadratic drag", "missing input", "parameter drift", "sensor bias"]
+STOP = 1.0
+SHORT, LONG = 0.05, 400  # step, rows
+
+
+def mass():
+    model = ssm.Model("mass", inputs=("u",))
+    model.prior(
+        lambda: {"d": ssm.HalfNormal(sd=2), "q": ssm.HalfNormal(sd=1), "r": ssm.HalfNormal(sd=0.1)}
+    )
+    model.initial(lambda: {"x": ssm.Normal(0, sd=0.1), "v": ssm.Normal(0, sd=0.1)})
+
+    @model.transition
+    def transition(x, v, u, d, q):
+        return {
+            "x": ssm.Dirac(x + SHORT * v),
+            "v": ssm.Normal(v + SHORT * (u - d * v - x), sd=q),
+        }
+
+    model.observation(lambda x, r: {"y": ssm.Normal(x, sd=r)})
+    return model
+
+
+@pytest.fixture(scope="module")
+def stopped():
+    """A mass on a spring that hits a stiff, inelastic stop on one side, seldom and shortly."""
+    rng, (x, v), y = np.random.default_rng(seed_of("stop")), (0.0, 0.0), np.empty(LONG)
+    t = SHORT * np.arange(LONG)
+    u = 1.2 * np.sin(0.9 * t) + 0.9 * np.sin(2.1 * t + 1.0)
+    for k in range(LONG):
+        y[k] = x + 0.003 * rng.standard_normal()
+        for _ in range(25):
+            beyond = max(x - STOP, 0.0)
+            v += SHORT / 25 * (u[k] - 0.4 * v - x - (900.0 * beyond + 40.0 * v * (beyond > 0.0)))
+            x += SHORT / 25 * v
+        v += 0.01 * rng.standard_normal()
+    problem = pose(mass(), {"u": u, "y": y})
+    train, missing = problem.experiments, missing_of(problem.experiments)
+    augmented = AugmentedModels(problem.trace, missing, {}, Settings())
+    base = augmented.base_fitter.fit(train, seed_sequence(1), {})
+    states = augmented.base_fitter.states(train[0], base.theta, random_state(seed_sequence(2)))
+    scales = Scales.of(problem.trace, states, train[0].y, train[0].u, LONG)
+    design = ScreenDesign(problem.trace, scales, missing, (), Settings(), EFFECTS)
+    screen = run_screen(design, train, base.theta, 60, seed_sequence(3), Checkpoint(None, {}))
+    return augmented, base, screen, train
+
+
+def column(screen, effect, equation, form=""):
+    return next(
+        k for k, c in enumerate(screen.design.candidates)
+        if (c.effect.name, c.equation) == (effect, equation) and form in c.form
+    )  # fmt: skip
+
+
+def refit(screen, k, gain=100.0):
+    """What `overlooked` reads of a refit."""
+    return SimpleNamespace(
+        index=(k,), candidates=(screen.design.candidates[k],), score=gain, penalised_gain=gain
+    )
+
+
+def told(screen, found):
+    return {(c.effect.name, c.form, c.equation)
+            for shapes in found for c in (screen.design.candidates[k] for k in shapes)}  # fmt: skip
+
+
+def test_the_mechanisms_of_the_equation_that_is_only_described(stopped):
+    screen = stopped[2]
+    ar1 = refit(screen, column(screen, "missing input", "v", "ar1"))
+    found = overlooked(screen, [ar1], 10.0)
+    assert ("hard stop", "upper", "v") in told(screen, found)
+    assert {(e, q) for e, _, q in told(screen, found)} <= {
+        ("hard stop", "v"),
+        ("quadratic drag", "v"),
+    }
+    shapes = [len(f) for f in found if screen.design.candidates[f[0]].form == "upper"]
+    assert shapes == [3]
+    # a noise scale is in the same equation; a bias of the sensor in none of a state
+    scale = refit(screen, column(screen, "parameter drift", "q"))
+    assert told(screen, overlooked(screen, [scale], 10.0)) == told(screen, found)
+    reading = refit(screen, column(screen, "parameter drift", "r"))
+    assert overlooked(screen, [reading], 10.0) == []
+
+
+def test_none_where_a_mechanism_gains_most_or_nothing_gains_enough(stopped):
+    screen = stopped[2]
+    ar1 = refit(screen, column(screen, "missing input", "v", "ar1"), gain=50.0)
+    stop = refit(screen, column(screen, "hard stop", "v", "upper"), gain=60.0)
+    assert overlooked(screen, [ar1, stop], 10.0) == []
+    assert overlooked(screen, [ar1], 51.0) == []
+    assert overlooked(screen, [], 0.0) == []
+    behind = overlooked(screen, [ar1, replace_score(stop, 40.0)], 10.0)
+    assert ("hard stop", "upper", "v") not in told(screen, behind)  # refitted already
+    assert ("hard stop", "lower", "v") in told(screen, behind)
+
+
+def replace_score(r, score):
+    return SimpleNamespace(**{**vars(r), "score": score, "penalised_gain": score})
+
+
+def test_no_mechanism_whose_score_has_the_sign_that_is_not_allowed(stopped):
+    screen = stopped[2]
+    ar1 = refit(screen, column(screen, "missing input", "v", "ar1"))
+    lower = [k for k, c in enumerate(screen.design.candidates) if c.form == "lower"]
+    z = screen.efficient.z.copy()
+    z[lower] = -module.AGAINST - 0.1
+    against = SimpleNamespace(
+        family=screen.family, groups=screen.groups, design=screen.design,
+        efficient=replace(screen.efficient, z=z),
+    )  # fmt: skip
+    assert ("hard stop", "lower", "v") not in told(screen, overlooked(against, [ar1], 10.0))
+    assert ("hard stop", "lower", "v") in told(screen, overlooked(screen, [ar1], 10.0))
+
+
+def test_a_stop_that_simulated_sets_go_beyond_is_found_at_a_finite_strength(stopped):
+    """The best of all strengths and shapes tried, by the exact likelihood of the model with it, and
+    far beyond what the score promises."""
+    augmented, base, screen, train = stopped
+    shapes = [k for k, c in enumerate(screen.design.candidates)
+              if c.form == "upper" and c.effect.name == "hard stop"]  # fmt: skip
+    found = best_start(augmented, base, screen, [shapes], train, 0)
+    k, strength = int(found["column"]), float(found["strength"])
+    c = screen.design.candidates[k]
+    assert dict(c.shape)["h"] == pytest.approx(STOP, abs=0.1)
+    fitter = augmented.fitter((c,))
+    values = base.by_component | {c.strength: strength, f"{c.strength}_h": dict(c.shape)["h"]}
+    theta = np.array([values[repr(s)] for s in fitter.problem.trace.parameter_symbols])
+    gained = fitter.value(train, theta) - augmented.base_fitter.value(train, base.theta)
+    assert gained > 10.0 * max(screen.efficient.gain[k], 1.0)
+
+
+def test_no_start_where_every_strength_costs(stopped):
+    augmented, base, screen, train = stopped
+    shapes = [k for k, c in enumerate(screen.design.candidates) if c.form == "lower"]
+    k = max(shapes, key=lambda k: dict(screen.design.candidates[k].shape)["h"])
+    assert best_start(augmented, base, screen, [[k]], train, 0) == {}
