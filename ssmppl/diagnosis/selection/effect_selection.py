@@ -25,7 +25,7 @@ from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.horizons import SimulationGain
-from ssmppl.diagnosis.selection.overlooked import best_start, overlooked
+from ssmppl.diagnosis.selection.overlooked import best_start, most_promising, overlooked
 from ssmppl.diagnosis.selection.refit import (
     EXPLAINED,
     Refit,
@@ -175,7 +175,7 @@ class EffectSelection:
         shapes = overlooked(self.screen, refits, critical_gain(self.screen, self.alpha))
         one = partial(best_start, self.augmented, out.base, self.screen, shapes, tuple(self.train))
         starts = self.checkpoint.map("looking for mechanisms of that equation", len(shapes), one)
-        found = [n for n in starts if "column" in n]
+        found = most_promising(starts, self.augmented.trace)
         more, _ = self._refit(
             out, out.base, self.screen, [[int(n["column"])] for n in found], seed, stage,
             strengths=[float(n["strength"]) for n in found],

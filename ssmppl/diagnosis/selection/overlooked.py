@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.effect import MECHANISM
@@ -29,7 +30,8 @@ from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.language.model.trace import Trace
 
-MOST = 16  # mechanisms that are fitted so
+MOST = 20  # mechanisms whose likelihood is looked at
+FITTED, FITTED_CALLED = 8, 5  # of these that are fitted; of a model that calls a simulator
 AGAINST = 2.0  # standard deviations by which a score may have the sign that is not allowed
 GRID = (1.0, 4.0, 16.0, 64.0)  # strengths, in standard errors by the data's own information
 HOPELESS = 20.0  # nats below the model as it is, beyond which larger strengths are not tried
@@ -86,10 +88,10 @@ def best_start(
     augmented: AugmentedModels, base: Fit, screen: Screen, shapes: Sequence[Sequence[int]],
     train: Sequence[Experiment], i: int,
 ) -> Numbers:  # fmt: skip
-    """The column and the strength with which the mechanism i fits best, the parameters as they are;
-    none where no strength fits better than the model as it is."""
+    """The column and the strength with which the mechanism i fits best, the parameters as they are,
+    and its gain; none where no strength fits better than the model as it is."""
     level = augmented.base_fitter.value(train, base.theta)
-    best, out = level, Numbers()
+    best, out = level, dict[str, float]()
     for k in shapes[i]:
         c = screen.design.candidates[k]
         try:
@@ -104,12 +106,19 @@ def best_start(
                         warnings.simplefilter("ignore")
                         value = fitter.value(train, theta)
                     if value > best:
-                        best, out = value, {"column": np.array(k), "strength": np.array(strength)}
+                        best = value
+                        out = {"column": k, "strength": strength, "gain": value - level}
                     if not value > level - HOPELESS:
                         break
         except SSMError:
             continue
-    return out
+    return {name: np.array(value) for name, value in out.items()}
+
+
+def most_promising(starts: Sequence[Numbers], trace: Trace) -> list[Numbers]:
+    """Of what `best_start` found, the best ones."""
+    found = sorted((n for n in starts if "gain" in n), key=lambda n: -float(n["gain"]))
+    return found[: FITTED_CALLED if simulators(trace) else FITTED]
 
 
 def _signs(c: Candidate) -> tuple[int, ...]:

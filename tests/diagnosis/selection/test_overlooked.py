@@ -13,7 +13,7 @@ from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection import overlooked as module
-from ssmppl.diagnosis.selection.overlooked import best_start, overlooked
+from ssmppl.diagnosis.selection.overlooked import best_start, most_promising, overlooked
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.statistics.checks import seed_of
@@ -147,6 +147,7 @@ def test_a_stop_that_simulated_sets_go_beyond_is_found_at_a_finite_strength(stop
     theta = np.array([values[repr(s)] for s in fitter.problem.trace.parameter_symbols])
     gained = fitter.value(train, theta) - augmented.base_fitter.value(train, base.theta)
     assert gained > 10.0 * max(screen.efficient.gain[k], 1.0)
+    assert float(found["gain"]) == pytest.approx(gained)
 
 
 def test_no_start_where_every_strength_costs(stopped):
@@ -154,3 +155,11 @@ def test_no_start_where_every_strength_costs(stopped):
     shapes = [k for k, c in enumerate(screen.design.candidates) if c.form == "lower"]
     k = max(shapes, key=lambda k: dict(screen.design.candidates[k].shape)["h"])
     assert best_start(augmented, base, screen, [[k]], train, 0) == {}
+
+
+def test_those_that_gain_most_are_fitted(stopped, monkeypatch):
+    starts = [{}, *({"gain": np.array(g)} for g in (1.0, 5.0, 3.0))]
+    trace = stopped[0].trace
+    assert [float(n["gain"]) for n in most_promising(starts, trace)] == [5.0, 3.0, 1.0]
+    monkeypatch.setattr(module, "FITTED", 2)
+    assert [float(n["gain"]) for n in most_promising(starts, trace)] == [5.0, 3.0]
