@@ -354,6 +354,7 @@ def test_flows_drawn_first_are_the_lagged_form():
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_flows_drawn_first_have_the_posterior_of_the_lagged_form():
     """The SEIR example, and its earlier form with the flows as states of their own."""
     data = read_csv(EXAMPLES / "seir" / "data.csv")[["reported"]]

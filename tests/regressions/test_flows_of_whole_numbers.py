@@ -79,6 +79,7 @@ def test_the_score_is_the_slope_of_the_sums():
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_maximum_is_that_of_the_sums():
     grid = np.linspace(0.15, 0.45, 121)
     values = np.array([passes(g)[0] for g in grid])

@@ -63,7 +63,7 @@ VARVE_RUNS = [
     pytest.param("PMMH", ssm.PMMH(particles=800, proposal="bootstrap"), 1_200, 500, False,
                  id="PMMH", marks=pytest.mark.slow),
     pytest.param("PGAS interweaved", ssm.PGAS(interweave="auto"), 5_000, 500, True,
-                 id="PGAS-interweaved", marks=pytest.mark.slow),
+                 id="PGAS-interweaved", marks=[pytest.mark.slow, pytest.mark.exhaustive]),
     pytest.param("PGAS", ssm.PGAS(), 20_000, 500, True, id="PGAS-long",
                  marks=[pytest.mark.slow, pytest.mark.exhaustive]),
     pytest.param("PGAS without tau", ssm.PGAS(particles=20, eliminate=("tau",)), 10_000, 500, False,

@@ -163,6 +163,7 @@ def test_a_maximum_is_the_same_and_compiles_less_itself(tmp_path):
 
 @needs_two
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_chains_are_the_same(tmp_path):
     code = """
     import ssmppl as ssm

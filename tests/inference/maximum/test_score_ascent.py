@@ -186,6 +186,7 @@ class ExactVarves:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_papers_printed_steps_diverge_and_the_mended_ones_stop_short(exact_values):
     """Schön et al. (2015), appendix, with exact gradients, so that no noise is to blame: steps
     0.01 k^(+2/3), as printed, diverge; 0.01 k^(-2/3) is at (0.9475, 41.65) after K = 250."""

@@ -231,6 +231,7 @@ def test_what_a_script_defines_travels(tmp_path, kind):
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_dask_over_commands(tmp_path):
     """A scheduler and workers that were started by themselves, on the loopback interface."""
     pytest.importorskip("distributed", reason="distributed is not installed")
