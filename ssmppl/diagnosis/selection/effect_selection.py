@@ -165,8 +165,9 @@ class EffectSelection:
                 )  # fmt: skip
                 refits = best_of_groups(screen, refits + more)
                 out.notes += [f"not refitted: {reason}" for reason in failed]
-        with self.checkpoint.failures.guard("mechanisms that the screen overlooks"):
-            refits = best_of_groups(screen, refits + self._overlooked(out, refits))
+        if self.singles is None:
+            with self.checkpoint.failures.guard("mechanisms that the screen overlooks"):
+                refits = best_of_groups(screen, refits + self._overlooked(out, refits))
         out.refits = refits
 
     def _overlooked(self, out: SelectionResult, refits: Sequence[Refit]) -> list[Refit]:
