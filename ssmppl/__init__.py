@@ -220,9 +220,15 @@ __all__ = [
 ]
 
 
+# Decorators that a model has.
+_OF_A_MODEL = ("prior", "initial", "transition", "observation", "proposal")
+
+
 def __getattr__(name: str) -> Any:
     if name not in _MODULES and name not in _LATER:
         hint = "" if name.startswith("__") else name_hint(name, __all__)
+        if name in _OF_A_MODEL:
+            hint = f'write model = ssm.Model("name"), and then @model.{name}'
         raise AttributeError(
             f"module {__name__!r} has no attribute {name!r}" + (f": {hint}" if hint else "")
         )

@@ -18,6 +18,8 @@ NAMES = {
     "GammaPoisson": "write ssm.NegativeBinomial(mean, dispersion=)",
     "Multinomial": "ssm.Binomial(left, p[k] / np.sum(p[k:]))",
     "loglikelihood": "write ssm.log_likelihood",
+    "prior": 'write model = ssm.Model("name"), and then @model.prior',
+    "transition": 'write model = ssm.Model("name"), and then @model.transition',
 }
 
 
