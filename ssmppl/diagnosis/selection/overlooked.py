@@ -23,7 +23,7 @@ from ssmppl.diagnosis.fitting.fit import Fit
 from ssmppl.diagnosis.run.checkpoint import Numbers
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.screening.statistics import typical_squares
-from ssmppl.diagnosis.selection.refit import Refit, only_by_particles
+from ssmppl.diagnosis.selection.refit import Refit, only_by_particles, preferred
 from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
@@ -39,12 +39,11 @@ HOPELESS = 20.0  # nats below the model as it is, beyond which larger strengths 
 
 def overlooked(screen: Screen, refits: Sequence[Refit], worth: float) -> list[list[int]]:
     """The shapes of each mechanism, by their columns, that was not refitted and acts in the
-    equation of the best refit, where that is none; the highest in the screen first.
+    equation of the refit that would be named, where that is none; the highest in the screen first.
 
     worth : nats that the best one has to gain.
     """
-    best = max(refits, key=lambda r: r.score, default=None)
-    if best is None or best.penalised_gain < worth:
+    if not refits or (best := preferred(refits, worth)[0]).penalised_gain < worth:
         return []
     c, done = best.candidates[0], {int(screen.groups[r.index[0]]) for r in refits}
     if c.effect.cause == MECHANISM:

@@ -14,6 +14,7 @@ from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection import overlooked as module
 from ssmppl.diagnosis.selection.overlooked import best_start, most_promising, overlooked
+from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.statistics.checks import seed_of
@@ -73,10 +74,8 @@ def column(screen, effect, equation, form=""):
 
 
 def refit(screen, k, gain=100.0):
-    """What `overlooked` reads of a refit."""
-    return SimpleNamespace(
-        index=(k,), candidates=(screen.design.candidates[k],), score=gain, penalised_gain=gain
-    )
+    """A refit that gains so much, one row ahead alone."""
+    return Refit((k,), (screen.design.candidates[k],), None, None, gain)
 
 
 def told(screen, found):
@@ -107,15 +106,12 @@ def test_none_where_a_mechanism_gains_most_or_nothing_gains_enough(stopped):
     ar1 = refit(screen, column(screen, "missing input", "v", "ar1"), gain=50.0)
     stop = refit(screen, column(screen, "hard stop", "v", "upper"), gain=60.0)
     assert overlooked(screen, [ar1, stop], 10.0) == []
+    assert overlooked(screen, [ar1, replace(stop, gain=26.0)], 10.0) == []  # named before
     assert overlooked(screen, [ar1], 51.0) == []
     assert overlooked(screen, [], 0.0) == []
-    behind = overlooked(screen, [ar1, replace_score(stop, 40.0)], 10.0)
+    behind = overlooked(screen, [ar1, replace(stop, gain=24.0)], 10.0)
     assert ("hard stop", "upper", "v") not in told(screen, behind)  # refitted already
     assert ("hard stop", "lower", "v") in told(screen, behind)
-
-
-def replace_score(r, score):
-    return SimpleNamespace(**{**vars(r), "score": score, "penalised_gain": score})
 
 
 def test_no_mechanism_whose_score_has_the_sign_that_is_not_allowed(stopped):
