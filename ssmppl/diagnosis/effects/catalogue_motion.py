@@ -23,7 +23,8 @@ from ssmppl.diagnosis.effects.effect import (
 from ssmppl.language.distributions import Dirac, Normal
 
 POSITION, OTHER, LOAD = {"x": "position"}, {"other": "other state"}, {"u": "any input"}
-# What meets a stiff stop within a step is never seen beyond it: where it would come to counts.
+# What meets a stiff stop within a simulator's step is not seen beyond it: where it would come to
+# counts. (In a written-out step that would make up for what Euler's method leaves out, too.)
 AHEAD = {"x": "ahead"}
 
 

@@ -42,8 +42,7 @@ a name or label     that one: "v", "x[0]"
 ==================  ===========================================================================
 "position"          the state that integrates the one it is bound to; where none does, that itself
 "integral"          likewise; not offered where none does
-"ahead"             "position", at the end of the step where that depends on no parameter, or comes
-                    from a simulator
+"ahead"             "position"; in a simulator's step, where that ends without the effect
 "moved"             how far that one moves in the step
 "other state"       another state: one candidate for each
 "any input"         an input: one candidate for each

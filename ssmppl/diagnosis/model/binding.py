@@ -246,11 +246,8 @@ def _given(
         raise _refuse(effect, f"nothing is bound to {name!r}, which is to be {what!r}",
                       "make its candidates by offers()")  # fmt: skip
     value = equations.parts[bound[name]].seen_from(role)
-    if what == "ahead" and bound[name] != part.label:
-        step = _value(equations.step(equations.parts[bound[name]]), effect)
-        # A jump in what depends on parameters would leave these without a derivative.
-        if equations.force(part) or all(s.data[0] != "parameter" for s in symbols_of([step])):
-            value = value + step
+    if what == "ahead" and bound[name] != part.label and equations.force(part):
+        value = value + _value(equations.step(equations.parts[bound[name]]), effect)
     return value
 
 

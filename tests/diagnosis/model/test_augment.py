@@ -180,35 +180,9 @@ def test_effects_do_what_their_formulas_say():
     acting = u - saturated * (u - np.clip(u, -limit, limit))
     step = 0.1 * (-k * x - c * v + b * acting)
     added = -drag * v * abs(v) - friction * np.tanh(v / shape["coulomb friction"]["v0"])
-    added -= stop * max(x + 0.1 * v - shape["hard stop"]["h"], 0.0)  # where it would come to
+    added -= stop * max(x - shape["hard stop"]["h"], 0.0)
     assert got["v"] == pytest.approx(v + step + added, rel=1e-12)
     assert got["x"] == pytest.approx(x + 0.1 * v + coarse * 0.5 * 0.1 * step, rel=1e-12)
-
-
-def test_where_a_position_would_come_to_holds_no_parameter():
-    """A stop looks a step ahead where that takes nothing but states: a jump in what depends on a
-    parameter would leave that one without a derivative."""
-
-    def stop_of(position):
-        m = ssm.Model("mass", inputs=("u",))
-        m.prior(lambda: {"k": ssm.HalfNormal(sd=1)})
-        m.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=1)})
-        m.transition(
-            lambda x, v, u, k: {
-                "x": ssm.Dirac(position(x, v, u, k)),
-                "v": ssm.Normal(v + 0.1 * (u - k * x), sd=0.1),
-            }
-        )
-        m.observation(lambda x: {"y": ssm.Normal(x, sd=0.1)})
-        t = trace(m)
-        c = next(c for c in offers(t, scales(t), ["hard stop"])[0] if c.form == "upper")
-        t = augment(t, [c.with_shape(h=1.0)])
-        at = {"x": 1.5, "v": 2.0, "u": 0.4, "k": 0.7, c.strength: 1.0}
-        return means(t, at)["v"] - (2.0 + 0.1 * (0.4 - 0.7 * 1.5))
-
-    assert stop_of(lambda x, v, u, k: x + 0.1 * v) == pytest.approx(-0.7)
-    ahead = stop_of(lambda x, v, u, k: x + 0.1 * (v + 0.1 * (u - k * x)))
-    assert ahead == pytest.approx(-0.5)
 
 
 def test_quantisation_rounds():

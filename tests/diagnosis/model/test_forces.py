@@ -107,6 +107,23 @@ def test_the_augmented_model_pushes_inside_of_the_step():
     np.testing.assert_allclose(found, wanted.vector, rtol=1e-12)
 
 
+def test_a_stop_pushes_against_where_the_step_would_end():
+    """The simulator is asked without the stop first; in a written-out step the position counts."""
+    traced, found = offered(model_of(), ["hard stop"])
+    stop = next(c for c in found if (c.equation, c.effect.form) == ("v2", "upper"))
+    stop = stop.with_shape(h=0.15)
+    state, forces = [0.2, 0.1, 0.7, 1.9], [0.4, 0.6, 0.0, 0.0]
+    free = coupled(state, forces, [0.3])
+    assert state[1] < 0.15 < free.x2
+    wanted = coupled(state, [*forces[:3], -5.0 * (free.x2 - 0.15)], [0.3])
+    at = dict(zip(("x1", "x2", "v1", "v2", "u1", "u2"), [*state, *forces[:2]], strict=True))
+    at |= {"d": 0.3, "s": 0.1, stop.strength: 5.0, "t": 1.0}
+    added = augment(traced, [stop])
+    roots = [added.transition[n].distribution.mean()[()] for n in ("x1", "x2", "v1", "v2")]
+    values = evaluate(roots, {s: at[s.data[1]] for s in symbols_of(roots)})
+    np.testing.assert_allclose(values, wanted.vector, rtol=1e-12)
+
+
 @pytest.mark.parametrize("torque_noise", [False, True])
 def test_the_score_at_zero_is_that_of_the_speeds(torque_noise):
     """With noise in the speeds (v - f) / s^2 df / dF g, of both speeds; with noise in the torques

@@ -44,7 +44,7 @@ def mass():
 
 @pytest.fixture(scope="module")
 def stopped():
-    """A mass on a spring that hits a stiff, inelastic stop on one side, seldom and shortly."""
+    """A mass on a spring that hits an inelastic stop on one side."""
     rng, (x, v), y = np.random.default_rng(seed_of("stop")), (0.0, 0.0), np.empty(LONG)
     t = SHORT * np.arange(LONG)
     u = 1.2 * np.sin(0.9 * t) + 0.9 * np.sin(2.1 * t + 1.0)
@@ -52,7 +52,7 @@ def stopped():
         y[k] = x + 0.003 * rng.standard_normal()
         for _ in range(25):
             beyond = max(x - STOP, 0.0)
-            v += SHORT / 25 * (u[k] - 0.4 * v - x - (900.0 * beyond + 40.0 * v * (beyond > 0.0)))
+            v += SHORT / 25 * (u[k] - 0.4 * v - x - (60.0 * beyond + 4.0 * v * (beyond > 0.0)))
             x += SHORT / 25 * v
         v += 0.01 * rng.standard_normal()
     problem = pose(mass(), {"u": u, "y": y})
@@ -137,13 +137,20 @@ def test_a_stop_that_simulated_sets_go_beyond_is_found_at_a_finite_strength(stop
     found = best_start(augmented, base, screen, [shapes], train, 0)
     k, strength = int(found["column"]), float(found["strength"])
     c = screen.design.candidates[k]
-    assert dict(c.shape)["h"] == pytest.approx(STOP, abs=0.1)
-    fitter = augmented.fitter((c,))
-    values = base.by_component | {c.strength: strength, f"{c.strength}_h": dict(c.shape)["h"]}
-    theta = np.array([values[repr(s)] for s in fitter.problem.trace.parameter_symbols])
-    gained = fitter.value(train, theta) - augmented.base_fitter.value(train, base.theta)
-    assert gained > 10.0 * max(screen.efficient.gain[k], 1.0)
-    assert float(found["gain"]) == pytest.approx(gained)
+    assert dict(c.shape)["h"] > 0.8 * STOP
+
+    def gain(k, strength):
+        c = screen.design.candidates[k]
+        fitter = augmented.fitter((c,))
+        values = base.by_component | {c.strength: strength, f"{c.strength}_h": dict(c.shape)["h"]}
+        theta = np.array([values[repr(s)] for s in fitter.problem.trace.parameter_symbols])
+        return fitter.value(train, theta) - augmented.base_fitter.value(train, base.theta)
+
+    best = gain(k, strength)
+    assert float(found["gain"]) == pytest.approx(best)
+    assert best > 10.0 * max(screen.efficient.gain[k], 1.0)
+    assert best > max(gain(k, 0.2 * strength), gain(k, 5.0 * strength))
+    assert best > max(gain(other, strength) for other in shapes if other != k)
 
 
 def test_no_start_where_every_strength_costs(stopped):
