@@ -144,11 +144,19 @@ def _refitted(
     augmented: AugmentedModels, r: Refit, i: int, shape: dict[str, float],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
 ) -> Refit | None:  # fmt: skip
-    """The refit with another shape of its effect i, from where it ended; None where it fails."""
+    """The refit with another shape of its effect i, from where it ended, with as much less strength
+    as it is longer: delays that shift alike. None where it fails."""
     candidates = (*r.candidates[:i], r.candidates[i].with_shape(**shape), *r.candidates[i + 1 :])
     try:
         fitter = augmented.fitter(candidates)
-        fit = fitter.fit(train, seed, r.fit.by_parameter, effort_for(candidates))
+        start = r.fit.by_parameter
+        old, upper = r.candidates[i], r.candidates[i].effect.upper
+        for name, value in shape.items():
+            strength = start[old.strength] * dict(old.shape)[name] / value
+            if np.isfinite(upper):
+                strength = np.minimum(strength, (1.0 - INSIDE) * upper)
+            start = start | {old.strength: strength}
+        fit = fitter.fit(train, seed, start, effort_for(candidates))
     except SSMError:
         return None
     gain = r.gain + fit.log_likelihood - r.fit.log_likelihood
