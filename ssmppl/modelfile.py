@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["labelled", "load_model", "parse_assignments", "parse_settings", "read_csv"]
 
+NOT_IN_TEXT = "\x1f"  # a character that separates nothing in a text: lines are read whole
 DATA_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".pq", ".nc")
 
 
@@ -190,7 +191,7 @@ def _with_empty_lines(table: pd.DataFrame, path: Path) -> pd.DataFrame:
 
     lines = pd.read_csv(
         path, header=None, names=["line"], dtype=str, keep_default_na=False, na_values=[""],
-        skip_blank_lines=False, skipinitialspace=True, index_col=False, quoting=csv.QUOTE_NONE,
+        skip_blank_lines=False, skipinitialspace=True, quoting=csv.QUOTE_NONE, sep=NOT_IN_TEXT,
     )["line"]  # fmt: skip
     filled = lines.notna().to_numpy().nonzero()[0]
     rows = filled[1:] - filled[0] - 1  # counted from the line after the names

@@ -387,6 +387,12 @@ def test_empty_lines_of_one_column_are_missing_rows(tmp_path, text, expected):
     assert list(read.index) == list(range(len(expected)))
 
 
+def test_a_column_of_decimal_commas_stays_what_it_is(tmp_path):
+    path = tmp_path / "d.csv"
+    path.write_text('y\n"1,5"\n\n"2,5"\n', encoding="utf-8")
+    assert list(read_csv(path)["y"].fillna("")) == ["1,5", "", "2,5"]
+
+
 # -- real processes
 def program(*args, **settings):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}

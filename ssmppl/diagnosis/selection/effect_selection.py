@@ -176,11 +176,15 @@ class EffectSelection:
         shapes = overlooked(self.screen, refits, critical_gain(self.screen, self.alpha))
         one = partial(best_start, self.augmented, out.base, self.screen, shapes, tuple(self.train))
         starts = self.checkpoint.map("looking for mechanisms of that equation", len(shapes), one)
+        for (k, *_), numbers in zip(shapes, starts, strict=True):
+            name = f"the likelihood with {self.screen.design.candidates[k]}"
+            self.checkpoint.failures.record_task(name, numbers)
         found = most_promising(starts, self.augmented.trace)
-        more, _ = self._refit(
+        more, failed = self._refit(
             out, out.base, self.screen, [[int(n["column"])] for n in found], seed, stage,
             strengths=[float(n["strength"]) for n in found],
         )  # fmt: skip
+        out.notes += [f"not refitted: {reason}" for reason in failed]
         return more
 
     def _simulation(self, base: Fit) -> tuple[SimulationGain, SimulationFit]:

@@ -25,7 +25,6 @@ from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.screening.statistics import typical_squares
 from ssmppl.diagnosis.selection.refit import Refit, only_by_particles, preferred
 from ssmppl.errors import SSMError
-from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.language.model.trace import Trace
@@ -66,9 +65,7 @@ def _equations(c: Candidate, trace: Trace) -> set[str]:
         return {c.equation}
     out = set()
     for name, site in trace.transition.items():
-        inside = symbols_of(
-            [e for a in site.distribution.parameters.values() for e in array(a).ravel()]
-        )
+        inside = symbols_of(site.distribution.arguments())
         if any(repr(s) == c.equation for s in inside if s.data[0] == "parameter"):
             out |= {repr(s) for s in site.components} | {name}
     return out

@@ -90,7 +90,7 @@ def shaped_all(
             made = _reshaped(old.candidates, scales, shapes, numbers["lengths"])
             fitter = augmented.fitter(made)
             fit = fitter.restored(train, numbers)
-            moved = sum(a != b for a, b in zip(old.candidates, made, strict=True) if lengths(a))
+            moved = sum(_whole(old.candidates) != numbers["lengths"])
             cost = old.cost + PRICE * (len(shapes) + moved)
             gain = fit.log_likelihood - base.log_likelihood
             new = Refit(old.index, made, fitter, fit, gain, cost)
