@@ -30,6 +30,7 @@ LITTLE = 0.01  # that two steps in a row gain where it is, too: on the way to a 
 CONVEX = 0.05  # minus an eigenvalue, in widths, beyond which the place is no top whatever its slope
 LEAST = 1e-3  # of the eigenvalues of the second derivatives as correlations
 FLAT = 1e-10  # second derivative in widths that is rounding
+NO_VALUE = -1e100  # below which a value is none: of a model that runs away, which overflows next
 
 QUASI_NEWTON_STEPS = 200
 GAIN = 1e-7  # of one of them, relative, from where on Newton's are quicker
@@ -67,6 +68,7 @@ class Top:
 
 def climb(function: Function, z: np.ndarray) -> Top | None:
     """The top near z (F,); None where the function has no value there. -inf is no value."""
+    function = _with_values(function)
     z = np.array(z, dtype=float)
     value = function(z)
     if not np.isfinite(value):
@@ -177,6 +179,7 @@ def information_by_slope(function: Slope, z: np.ndarray) -> np.ndarray:
 def information_at(function: Function, z: np.ndarray) -> np.ndarray:
     """(F, F) minus the second derivatives at z (F,), by differences over a small share of a width;
     NaN where there is a point without a value."""
+    function = _with_values(function)
     z = np.array(z, dtype=float)
     nothing = np.full((len(z), len(z)), np.nan)
     value = function(z)
@@ -191,6 +194,16 @@ def information_at(function: Function, z: np.ndarray) -> np.ndarray:
 
     _, _, curvature = _derivatives(kept, z, value, width, half=FINE)
     return curvature / np.outer(width, width) if np.all(np.isfinite(seen)) else nothing
+
+
+def _with_values(function: Function) -> Function:
+    """The function with -inf where it is below `NO_VALUE`."""
+
+    def of(z: np.ndarray) -> float:
+        value = function(z)
+        return value if value > NO_VALUE else -np.inf
+
+    return of
 
 
 def _further(

@@ -81,6 +81,22 @@ def test_next_to_where_there_is_no_value():
     assert 1.9 < found.z[0] < 2.0
 
 
+def test_values_next_to_overflow_are_none():
+    """A likelihood of a model that runs away is a number still, and its differences are none: here
+    where two coordinates move at once."""
+
+    def function(z):
+        return -float(z @ z) if z.min() < 0.5 else -1e308
+
+    with np.errstate(all="raise"):
+        for start in (0.49, 0.4, 0.2):
+            found = climb(function, np.array([start, start]))
+            assert found.value == pytest.approx(0.0, abs=GOOD)
+            near = information_at(function, np.array([start, start]))
+            assert np.isnan(near).all() or near == pytest.approx(2.0 * np.eye(2), abs=1e-3)
+        assert climb(function, np.array([3.0, 3.0])) is None
+
+
 def test_where_there_is_no_value_there_is_no_climb():
     assert climb(lambda z: -np.inf, np.zeros(2)) is None
     found = climb(lambda z: 1.5, np.zeros(0))
