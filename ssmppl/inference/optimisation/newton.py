@@ -30,7 +30,7 @@ LITTLE = 0.01  # that two steps in a row gain where it is, too: on the way to a 
 CONVEX = 0.05  # minus an eigenvalue, in widths, beyond which the place is no top whatever its slope
 LEAST = 1e-3  # of the eigenvalues of the second derivatives as correlations
 FLAT = 1e-10  # second derivative in widths that is rounding
-NO_VALUE = -1e100  # below which a value is none: of a model that runs away, which overflows next
+NO_VALUE = 1e100  # size from which a value is none: of a model that runs away, to overflow next
 
 QUASI_NEWTON_STEPS = 200
 GAIN = 1e-7  # of one of them, relative, from where on Newton's are quicker
@@ -197,11 +197,11 @@ def information_at(function: Function, z: np.ndarray) -> np.ndarray:
 
 
 def _with_values(function: Function) -> Function:
-    """The function with -inf where it is below `NO_VALUE`."""
+    """The function with -inf where it is as large as `NO_VALUE`, of whatever sign."""
 
     def of(z: np.ndarray) -> float:
         value = function(z)
-        return value if value > NO_VALUE else -np.inf
+        return value if abs(value) < NO_VALUE else -np.inf
 
     return of
 
