@@ -14,7 +14,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from ssmppl.inference.optimisation.batched_newton import summed
+from ssmppl.inference.optimisation.parts import Parts, summed
 
 OUTWARDS = (1.0, 3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 3 to 160,000
 FREE = 0.1  # nats that going outwards may cost where the bound is the place of the maximum
@@ -60,9 +60,9 @@ def hold_at_bounds(
     return z, mask
 
 
-def flat_outwards(function: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -> np.ndarray:
+def flat_outwards(function: Callable[[np.ndarray], Parts], z: np.ndarray) -> np.ndarray:
     """(F,) bool: which may have run to a bound, as the first step outwards costs nothing; by the
-    function (B, F) -> (B,) of many points at once."""
+    function (B, F) -> B sums of many points at once."""
     steps = OUTWARDS[0] * np.eye(len(z))
     here, *away = summed(function(np.vstack([z[None], z + steps, z - steps])))
     found: np.ndarray = np.any(np.reshape(away, (2, -1)) >= here - FREE, axis=0)

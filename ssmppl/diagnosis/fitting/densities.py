@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ssmppl.inference.optimisation.batched_newton import parts_of, summed
+from ssmppl.inference.optimisation.parts import Increments, Parts, parts_of, summed
 from ssmppl.inference.preparation.space import Space
 
 POINTS, SPREAD, CLIMBS = 45, 1.5, 3  # round a start, where many points are looked at together
@@ -27,16 +27,10 @@ def density_of(
     return value
 
 
-def densities_of(
-    space: Space, increments: Callable[[np.ndarray], np.ndarray]
-) -> Callable[[np.ndarray], np.ndarray]:
-    """As `density_of`, of many points z (B, F) at once: (B, R + 1) the R increments of the
-    log-likelihood, and the log prior density.
+def densities_of(space: Space, increments: Increments) -> Callable[[np.ndarray], Parts]:
+    """As `density_of`, of many points z (B, F) at once, by parts."""
 
-    increments : (B, P) parameter vectors -> (B, R).
-    """
-
-    def values(z: np.ndarray) -> np.ndarray:
+    def values(z: np.ndarray) -> Parts:
         found = [space.point(row) for row in z]
         theta, prior, jacobian = (np.array(part) for part in zip(*found, strict=True))
         return parts_of(increments, theta, np.where(jacobian > -np.inf, prior, -np.inf))
@@ -45,7 +39,7 @@ def densities_of(
 
 
 def best_of_many(
-    densities: Callable[[np.ndarray], np.ndarray], points: Sequence[np.ndarray],
+    densities: Callable[[np.ndarray], Parts], points: Sequence[np.ndarray],
     seed: np.random.SeedSequence,
 ) -> np.ndarray:  # fmt: skip
     """(K, F) the best of these points and of others round the first."""

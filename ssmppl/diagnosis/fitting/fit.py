@@ -37,7 +37,7 @@ from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.optimisation.batched_newton import climb_together, summed
+from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.batched_newton import information_at as information_of_many
 from ssmppl.inference.optimisation.newton import (
     GOOD,
@@ -45,6 +45,7 @@ from ssmppl.inference.optimisation.newton import (
     climb,
     information_at,
 )
+from ssmppl.inference.optimisation.parts import Increments, Parts, Predictions, parts_of, summed
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.preparation.pilot import climb_to_mode
@@ -334,26 +335,26 @@ class Fitter:
 
         return value
 
-    def _extended_of_many(self, problem: Problem) -> Callable[[np.ndarray], np.ndarray] | None:
+    def _extended_of_many(self, problem: Problem) -> Increments | None:
         """(B, P) parameter vectors -> (B, R), the increments of log p(y | theta) by the extended
-        Kalman filter, where the model calls a simulator, so that many at once take little longer
-        than one; else None."""
+        Kalman filter, and its predictions, where the model calls a simulator, so that many at once
+        take little longer than one; else None."""
         found = extended_model(problem.trace)
         if isinstance(found, NotApplicable) or self.settings.proposal != "twisted":
             return None
         shift = len(problem.experiments) * self.log_correction
 
-        def values(theta: np.ndarray) -> np.ndarray:
+        def values(theta: np.ndarray) -> tuple[np.ndarray, Predictions | None]:
             with thriftily():  # climbs look at differences that are far larger than its error
-                rows = found.increments(problem.experiments, theta)
+                rows, predictions = found.increments_and_predictions(problem.experiments, theta)
             rows[:, 0] += shift
-            return rows
+            return rows, predictions
 
         return values
 
     def _fit_together(
         self, space: Space, smooth: Callable[[np.ndarray], float],
-        many: Callable[[np.ndarray], np.ndarray], seed: np.random.SeedSequence, effort: Effort,
+        many: Increments, seed: np.random.SeedSequence, effort: Effort,
     ) -> Fit:  # fmt: skip
         """The top of the extended filter's likelihood, whose points are looked at together, to
         within what a decision needs."""
@@ -597,7 +598,7 @@ class Fitter:
         problem = replace(self.problem, experiments=tuple(experiments))
         many = self._extended_of_many(problem)
         if many is not None:
-            return summed(many(theta))
+            return summed(parts_of(many, theta, np.zeros(len(theta))))
         particles = self.settings.particles
         return np.array([self._estimate(problem, t, particles, stream.copy()) for t in theta])
 
@@ -641,11 +642,11 @@ class Fitter:
             found = np.full_like(fit.information, np.nan)
         return replace(fit, information=found)
 
-    def _curvature(self, fit: Fit, many: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    def _curvature(self, fit: Fit, many: Increments) -> np.ndarray:
         """(F', F') minus the second derivatives at the fit in what is not at a bound."""
         free, densities = ~fit.at_bound, densities_of(fit.space, many)
 
-        def inside(points: np.ndarray) -> np.ndarray:
+        def inside(points: np.ndarray) -> Parts:
             z = np.repeat(fit.z[None], len(points), axis=0)
             z[:, free] = points
             return densities(z)

@@ -46,6 +46,7 @@ def predict(
 
     Experiments without any are left out.
     """
+    called = isinstance(fitter.smoother.extended, Extended)  # its increments are of each row
     held = [i for i, c in enumerate(counts) if c.any()] or [0]
     experiments, counts = [experiments[i] for i in held], [counts[i] for i in held]
 
@@ -54,7 +55,6 @@ def predict(
         passes = fitter.smoother.run(experiments, fit.theta, stream)
         for p in passes:
             p.log_increments[:1] += fitter.log_correction
-        called = isinstance(fitter.smoother.extended, Extended)  # its increments are of each row
         if fitter.exact or called or fitter.settings.proposal != "twisted":
             return passes
         return [
@@ -62,7 +62,7 @@ def predict(
             for p, e, c in zip(passes, experiments, counts, strict=True)
         ]
 
-    repeats = 1 if fitter.exact else runs
+    repeats = 1 if fitter.exact or called else runs
     passes = run_tasks(one, range(repeats))
 
     def kept(values: list[np.ndarray]) -> np.ndarray:

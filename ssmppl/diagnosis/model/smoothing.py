@@ -139,7 +139,7 @@ class Smoother:
         ------
         SamplingError : all weights vanish, or are NaN; names the step and the parameters.
         """
-        with thriftily():
+        with thriftily(alike=True):
             return [self._one(e, theta, stream, predicted or ahead, ahead) for e in experiments]
 
     def _one(

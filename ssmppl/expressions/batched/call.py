@@ -104,6 +104,10 @@ def groups(nodes: Iterable[Expr]) -> dict[Expr, tuple[Expr, ...]]:
 def computed(function: Any, wanted: tuple[Index, ...], x: np.ndarray) -> np.ndarray:
     """(len(wanted), outputs, B) at x (B, K)."""
     kept: dict[Any, dict[Any, np.ndarray]] | None = getattr(_here, "kept", None)
+    if kept is not None and _here.alike and 1 < len(x) <= MOST_KEPT:
+        found = _at_centre(function, wanted, x, kept)
+        if np.isfinite(found).all():
+            return found
     stencil, known = stencil_of(wanted, x.shape[1], kept is not None), None
     if kept is not None and len(x) <= MOST_KEPT:
         key = function.name, np.ascontiguousarray(x).tobytes()
@@ -114,16 +118,39 @@ def computed(function: Any, wanted: tuple[Index, ...], x: np.ndarray) -> np.ndar
     return found
 
 
+def _at_centre(
+    function: Any, wanted: tuple[Index, ...], x: np.ndarray, kept: dict[Any, dict[Any, np.ndarray]]
+) -> np.ndarray:
+    """As `computed`, the derivatives for all points those at their mean. kept : by the points, the
+    derivatives that are known, (outputs, B) or (outputs, 1)."""
+    known = kept.setdefault((function.name, x.tobytes(), "centre"), {})
+    new = [index for index in wanted if index not in known]
+    if slopes := tuple(index for index in new if index):
+        found = computed(function, slopes, x.mean(axis=0)[None])
+        known |= dict(zip(slopes, found, strict=True))
+    if () in new:
+        known[()] = function.at(np.ascontiguousarray(x)).T
+    out = np.empty((len(wanted), function.outputs, len(x)))
+    for w, index in enumerate(wanted):
+        out[w] = known[index]
+    return out
+
+
 @contextmanager
-def thriftily() -> Iterator[None]:
+def thriftily(alike: bool = False) -> Iterator[None]:
     """Within it this thread's derivatives are by few points (`differences.py`), and values are kept
     by their points: parts of a model that are compiled apart ask for the same ones, one after the
-    other. Not for longer, as what the user's function reads may be changed between calls."""
-    _here.kept = {}
+    other. Not for longer, as what the user's function reads may be changed between calls.
+
+    alike : the points of each call are draws round one, at whose mean derivatives are taken for
+    all of them: an approximation by as much as slopes differ among the draws.
+    """
+    before = getattr(_here, "kept", None), getattr(_here, "alike", False)
+    _here.kept, _here.alike = {}, alike
     try:
         yield
     finally:
-        del _here.kept
+        _here.kept, _here.alike = before
 
 
 def of_group(group: Sequence[Expr], args: Sequence[Any]) -> list[np.ndarray]:

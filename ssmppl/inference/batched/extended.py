@@ -24,6 +24,7 @@ from ssmppl.inference.exact.derivatives import Scored
 from ssmppl.inference.exact.kalman import KalmanMoments
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
 from ssmppl.inference.gaussian.moments import ApproximateKalman
+from ssmppl.inference.optimisation.parts import Predictions
 from ssmppl.inference.run.problem import Problem, missing_of
 from ssmppl.language.model.trace import Trace, once_per_trace
 
@@ -57,6 +58,14 @@ class Extended(Scored):
         """(B, R) likewise, of each of the rows of all experiments, whose sum that is."""
         data = tuple(experiments)
         return self._filter(data).increments(data, theta)
+
+    def increments_and_predictions(
+        self, experiments: Iterable[Experiment], theta: np.ndarray
+    ) -> tuple[np.ndarray, Predictions | None]:
+        """The increments, and the Gaussian predictions whose log densities they are, about; None
+        where observations are not Gaussian."""
+        data = tuple(experiments)
+        return self._filter(data).increments_and_predictions(data, theta)
 
     def trajectories(
         self, experiment: Experiment, theta: np.ndarray, rng: np.random.Generator

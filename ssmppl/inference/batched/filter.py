@@ -14,11 +14,18 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.proposals.twisted import LookaheadModel, jacobian, lookahead_model
+from ssmppl.analysis.proposals.twisted import (
+    LookaheadModel,
+    jacobian,
+    lookahead_model,
+    noise_form,
+)
 from ssmppl.analysis.vectorised import vectorised
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
-from ssmppl.expressions.expr import Expr, symbols_of
+from ssmppl.expressions.calculus import NotDifferentiable, differentiate
+from ssmppl.expressions.expr import Expr, depends_on, symbols_of
+from ssmppl.inference.optimisation.parts import Predictions
 from ssmppl.language.model.trace import Trace
 
 NEWTON_STEPS, HALVINGS, CLOSE = 10, 40, 0.05  # as in the compiled filter
@@ -46,11 +53,15 @@ class BatchedFilter:
         d = self.size = len(trace.state_symbols)
         first, later = found.initial, found.transition
         half = [found.curvature[i, j] for i in range(d) for j in range(i + 1)]
+        place = np.zeros((d, d), dtype=int)  # of each entry of a curvature among these
+        place[np.tril_indices(d)] = np.arange(len(half))
+        self._half = np.maximum(place, place.T).ravel()
         self._begin = _Part(trace, [*first.at_rest(), *first.spread().ravel()])
         self._move = _Part(
             trace, [*later.at_rest(), *jacobian(later, trace).ravel(), *later.spread().ravel()]
         )
         self._look = _Part(trace, [found.observed, *found.slope, *half])
+        self._predict = _gaussian_observation(trace)
 
     def log_likelihoods(
         self, experiments: Sequence[Experiment], theta: np.ndarray,
@@ -71,7 +82,24 @@ class BatchedFilter:
     ) -> np.ndarray:  # fmt: skip
         """(B, R) likewise, of each of the R rows of all data sets; -inf in all of them where a
         point has no number."""
-        lanes = _Lanes(self.trace, experiments, np.asarray(theta, dtype=float))
+        return self._followed(_Lanes(self.trace, experiments, np.asarray(theta)), record, None)
+
+    def increments_and_predictions(
+        self, experiments: Sequence[Experiment], theta: np.ndarray
+    ) -> tuple[np.ndarray, Predictions | None]:
+        """The increments, and the predictions of each row by what is linear there; None of
+        observations that are not Gaussian."""
+        lanes, seen = _Lanes(self.trace, experiments, np.asarray(theta)), list[_Seen]()
+        rows = self._followed(lanes, None, seen)
+        if not seen or len(seen) < lanes.steps:
+            return rows, None
+        error, covariance = (np.stack(part, axis=1) for part in zip(*seen, strict=True))
+        return rows, Predictions(lanes.of_vectors(error), lanes.of_vectors(covariance))
+
+    def _followed(
+        self, lanes: _Lanes, record: list[Moments] | None, seen: list[_Seen] | None
+    ) -> np.ndarray:
+        """(B, R) increments; `seen` takes the predictions of each row."""
         out = np.zeros((lanes.count, lanes.steps))
         dead = np.zeros(lanes.count, dtype=bool)
         x = covariance = np.empty(0)
@@ -86,6 +114,8 @@ class BatchedFilter:
                     rest, slope, spread = self._moved(lanes, x)
                     cross = covariance @ slope.transpose(0, 2, 1)
                     p = slope @ cross + spread @ spread.transpose(0, 2, 1)
+                if seen is not None and self._predict is not None:
+                    seen.append(self._predict(lanes, rest, p))
                 increment, x, covariance = self._updated(lanes, rest, p)
                 after, before = (np.einsum("lii->li", c) for c in (covariance, p))
                 fine = (after >= RESOLVED * before) & np.isfinite(x)
@@ -120,9 +150,7 @@ class BatchedFilter:
         """log g (L,), its slope (L, D) and minus its curvature (L, D, D), not negative."""
         d = self.size
         values = self._look(lanes, x, None)
-        h = np.empty((len(values), d, d))
-        for k, (i, j) in enumerate(zip(*np.tril_indices(d), strict=True)):
-            h[:, i, j] = h[:, j, i] = values[:, 1 + d + k]
+        h = values[:, 1 + d + self._half].reshape(-1, d, d)
         if not self.flat:
             h = _positive_part(h)
         return values[:, 0], values[:, 1 : 1 + d], h
@@ -222,6 +250,44 @@ class _Part:
         return out
 
 
+_Seen = tuple[np.ndarray, np.ndarray]  # of one row, in each lane: as of `Predictions`
+
+
+class _GaussianObservation:
+    """What is observed, as mean (K,) and noise about it, and by the states (K, D)."""
+
+    def __init__(self, trace: Trace, mean: Sequence[Expr], slope: np.ndarray, spread: np.ndarray):
+        self.channels, self.states = slope.shape
+        self.trace = trace
+        self._part = _Part(trace, [*mean, *slope.ravel(), *spread.ravel()])
+
+    def __call__(self, lanes: _Lanes, rest: np.ndarray, p: np.ndarray) -> _Seen:
+        """The predictions of a row from the mean (L, D) and covariance (L, D, D) of its states."""
+        k, d = self.channels, self.states
+        values = self._part(lanes, rest, None)
+        mean, slope = values[:, :k], values[:, k : k + k * d].reshape(-1, k, d)
+        spread = values[:, k + k * d :].reshape(len(values), k, -1)
+        covariance = slope @ p @ slope.transpose(0, 2, 1) + spread @ spread.transpose(0, 2, 1)
+        y, seen = lanes.measured()
+        both = seen[:, :, None] & seen[:, None, :]
+        return np.where(seen, y - mean, 0.0), np.where(both, covariance, np.eye(k))
+
+
+def _gaussian_observation(trace: Trace) -> _GaussianObservation | None:
+    """None of observations that are not all driven by Gaussian noise, or look back."""
+    form = noise_form(list(trace.observations.values()), list(trace.observation_symbols))
+    if isinstance(form, NotApplicable):
+        return None
+    mean, spread = form.at_rest(), form.spread()
+    if any(depends_on(e, trace.observation_symbols) for e in [*mean, *spread.ravel()]):
+        return None  # a channel by another one of its row
+    try:
+        slope = np.array([differentiate(list(mean), s) for s in trace.state_symbols]).T
+    except NotDifferentiable:
+        return None
+    return _GaussianObservation(trace, list(mean), slope, spread)
+
+
 class _Lanes:
     """Parameters and data of each lane: lane e B + b has the data set e and the vector b."""
 
@@ -235,7 +301,7 @@ class _Lanes:
             ("observation", trace.observation_symbols), ("input", trace.input_symbols),
         ):  # fmt: skip
             self.columns |= {(kind, s.data[1:]): k for k, s in enumerate(symbols)}
-        tiled = np.tile(theta, (self.sets, 1))
+        tiled = np.tile(np.asarray(theta, dtype=float), (self.sets, 1))
         self.theta = {s: tiled[:, k] for k, s in enumerate(trace.parameter_symbols)}
         self.arrays = {
             "observation": [e.y for e in experiments], "seen": [e.seen for e in experiments],
@@ -251,6 +317,15 @@ class _Lanes:
     def going(self) -> Any:
         """(L,) whether the lane's data have this row; True where all have."""
         return True if self.t < self.shortest else self.t < self.ends
+
+    def measured(self) -> tuple[np.ndarray, np.ndarray]:
+        """(L, K) the readings of the row in each lane, and whether there are any; none behind the
+        end of a lane's data."""
+        y, seen = (
+            np.repeat([a[min(self.t, len(a) - 1)] for a in self.arrays[name]], self.vectors, axis=0)
+            for name in ("observation", "seen")
+        )  # fmt: skip
+        return y, (seen == 1.0) & (self.t < self.ends)[:, None]
 
     def value(self, symbol: Expr) -> Any:
         """A number, or (L,), of a symbol that is no state's."""
@@ -272,8 +347,8 @@ class _Lanes:
         return values[0] if self.sets == 1 else np.repeat(values, self.vectors)
 
     def of_vectors(self, rows: np.ndarray) -> np.ndarray:
-        """(B, R) of lanes (L, T): the rows of all data sets, one after the other."""
-        sets = rows.reshape(self.sets, self.vectors, -1)
+        """(B, R, ...) of lanes (L, T, ...): the rows of all data sets, one after the other."""
+        sets = rows.reshape(self.sets, self.vectors, *rows.shape[1:])
         return np.concatenate(sets, axis=1)
 
 

@@ -119,14 +119,14 @@ class ApproximateKalman:
                 out[:, t] = mode.x[t] + off
             return mode.log_likelihood, out
         found = filtered or self.filtered(e, theta)
-        gains = _gains(found)
+        gains, left = _gains(found), found.covariance.copy()
+        left[:-1] -= gains[1:] @ found.cross[1:].transpose(0, 2, 1)
+        noise = rng.standard_normal((steps, draws, d)) @ _roots(left)[::-1].transpose(0, 2, 1)
         for t in range(steps - 1, -1, -1):
-            mean, covariance = found.mean[t][None], found.covariance[t]
+            mean = found.mean[t][None]
             if t + 1 < steps:
-                gain = gains[t + 1]
-                mean = mean + (out[:, t + 1] - found.predicted[t + 1]) @ gain.T
-                covariance = covariance - gain @ found.cross[t + 1].T
-            out[:, t] = mean + rng.standard_normal((draws, d)) @ _root(covariance).T
+                mean = mean + (out[:, t + 1] - found.predicted[t + 1]) @ gains[t + 1].T
+            out[:, t] = mean + noise[steps - 1 - t]
         return float(np.sum(found.increments)), out
 
     def filtered(self, e: Experiment, theta: np.ndarray) -> FilterMoments:
@@ -194,19 +194,20 @@ class ApproximateKalman:
         )
 
 
-def _gains(found: FilterMoments) -> list[np.ndarray]:
-    """Gains of each row but the first, (D, D): how x_{t-1} goes with x_t less its prediction."""
-    out = [np.zeros_like(found.cross[0])]
-    for cross, covariance in zip(found.cross[1:], found.predicted_covariance[1:], strict=True):
-        scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-        scale[scale == 0.0] = 1.0
-        alike = np.linalg.pinv(covariance / np.outer(scale, scale), ROUNDING, hermitian=True)
-        out.append((cross / scale) @ alike / scale)
+def _gains(found: FilterMoments) -> np.ndarray:
+    """Gains (T, D, D) of each row: how x_{t-1} goes with x_t less its prediction; 0 of the first."""
+    out = np.zeros_like(found.cross)
+    covariance = found.predicted_covariance[1:]
+    scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    scale[scale == 0.0] = 1.0
+    both = scale[:, :, None] * scale[:, None, :]
+    alike = np.linalg.pinv(covariance / both, ROUNDING, hermitian=True)
+    out[1:] = (found.cross[1:] / scale[:, None, :]) @ alike / scale[:, None, :]
     return out
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """A root (D, D) of a covariance that is positive semidefinite up to rounding."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    root: np.ndarray = vectors * np.sqrt(np.maximum(values, 0.0))
+def _roots(covariance: np.ndarray) -> np.ndarray:
+    """Roots (T, D, D) of covariances that are positive semidefinite up to rounding."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.transpose(0, 2, 1)))
+    root: np.ndarray = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return root

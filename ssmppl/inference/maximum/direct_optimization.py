@@ -34,7 +34,8 @@ from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximizati
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.optimisation.batched_newton import climb_together, parts_of, summed
+from ssmppl.inference.optimisation.batched_newton import climb_together
+from ssmppl.inference.optimisation.parts import Parts, parts_of, summed
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
 from ssmppl.inference.optimisation.units import units_at
 from ssmppl.inference.preparation.exact_models import ExactModel, likelihood_by
@@ -550,16 +551,15 @@ class BatchedClimb:
         """(B,) the log-likelihood at z (B, F), with the prior where it counts; -inf for none."""
         return summed(self.parts(z))
 
-    def parts(self, z: np.ndarray) -> np.ndarray:
-        """(B, R + 1) of the same sums the R increments of the log-likelihood, and the log prior
-        density or 0."""
+    def parts(self, z: np.ndarray) -> Parts:
+        """The same sums, the last part 0 where the prior does not count."""
         self.evaluations += len(z)
         found = [self.setup.space.point(row) for row in z]
         theta, prior, _ = (np.array(part) for part in zip(*found, strict=True))
         data = self.setup.problem.experiments
-        out = parts_of(lambda each: self.model.increments(data, each), theta, prior)
         if not self.setup.with_prior:  # it says where the density is, and no more
-            out[:, -1] = np.where(prior > -np.inf, 0.0, -np.inf)
+            prior = np.where(prior > -np.inf, 0.0, -np.inf)
+        out = parts_of(partial(self.model.increments_and_predictions, data), theta, prior)
         total = summed(out)
         k = int(np.argmax(total))
         if total[k] > self.best_value:

@@ -21,9 +21,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ssmppl.inference.optimisation.newton import Top, bfgs_update, newton_step
+from ssmppl.inference.optimisation.parts import Parts, split, summed
 
-# (B, F) -> (B,), -inf where there is no value; or (B, R), the parts of a sum (`parts_of`).
-Function = Callable[[np.ndarray], np.ndarray]
+# (B, F) -> (B,), -inf where there is no value; or the parts of sums.
+Values = np.ndarray | Parts
+Function = Callable[[np.ndarray], Values]
 
 STEPS = 60
 FIRST, SHORTEST, LONGEST = 0.02, 1e-4, 0.1  # steps of differences in z
@@ -94,7 +96,11 @@ def climb_together(function: Function, starts: np.ndarray, precise: bool = True)
     found = function(starts)
     climbers = [
         Climber(
-            z.copy(), float(v), np.full(len(z), FIRST), path=[z.copy()], by_parts=found.ndim > 1
+            z.copy(),
+            float(v),
+            np.full(len(z), FIRST),
+            path=[z.copy()],
+            by_parts=isinstance(found, Parts),
         )
         for z, v in zip(starts, summed(found), strict=True)
         if np.isfinite(v)
@@ -155,7 +161,7 @@ def _step(function: Function, climbers: list[Climber]) -> None:
         if k == 0:
             _take(c, wholes[c], c.tells, move)
         else:
-            c.stale, c.by_parts = c.stale or SHARES[k] < MUCH, wholes[c].ndim > 1
+            c.stale, c.by_parts = c.stale or SHARES[k] < MUCH, isinstance(wholes[c], Parts)
             later[c] = None if c.stale else SHARES[k] * move
     if later:
         _differentiate(function, later)
@@ -166,12 +172,12 @@ def _promised(c: Climber, move: np.ndarray) -> float:
     return max(float(c.slope @ move - 0.5 * move @ c.information @ move), 0.0)
 
 
-def _together(function: Function, sets: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+def _together(function: Function, sets: Sequence[Sequence[np.ndarray]]) -> list[Values]:
     """The values of each set of points, by one call."""
     if not sets:
         return []
     found = function(np.array([z for own in sets for z in own]))
-    return np.split(found, np.cumsum([len(own) for own in sets])[:-1])
+    return split(found, [len(own) for own in sets])
 
 
 def _differentiate(function: Function, climbers: Mapping[Climber, np.ndarray | None]) -> None:
@@ -205,24 +211,29 @@ def _moved(z: np.ndarray, by: dict[int, float]) -> np.ndarray:
     return out
 
 
-def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = None) -> None:
+def _take(c: Climber, found: Values, tells: int, move: np.ndarray | None = None) -> None:
     """Slope, curvature and the next steps from the values at a stencil, that `move` led to."""
-    values, parts, size = summed(values), values if values.ndim > 1 else None, c.size
+    values, parts, size = summed(found), found if isinstance(found, Parts) else None, c.size
+    expected = parts is not None and parts.predictions is not None
     if tells <= SLOPES:
+        if tells == SLOPES and parts is not None:
+            c.bent = parts.bent(size)
+        if parts is not None and expected:
+            c.information, c.rough = parts.information(size, c.bent), False
         if tells == FORWARD:
             known = 0.0 if c.rough else np.diagonal(c.information)
             slope = (values[1:] - values[0]) / size + 0.5 * known * size
         else:
             up, down = np.split(values[1:], 2)
             slope = _slopes(values[0], up, down, size)
-        if tells == SLOPES and parts is not None:
-            c.bent = _bent(parts, size)
         curvature = -c.information
-        if move is not None:
+        if expected:
+            pass
+        elif move is not None:
             curvature = -_updated(c.information, move, c.slope - slope, c.rough)
             c.rough = False
         elif parts is not None:
-            curvature, c.rough = -_outer_products(parts, size, c.bent), True
+            curvature, c.rough = -parts.information(size, c.bent), True
         c.stale = not np.all(np.isfinite(slope))
         c.by_parts = c.stale and tells == FORWARD and parts is not None
     else:
@@ -232,9 +243,9 @@ def _take(c: Climber, values: np.ndarray, tells: int, move: np.ndarray | None = 
     c.slope = np.where(missing, 0.0, slope)
     c.information = np.where(np.isfinite(curvature), -curvature, 0.0)
     c.distance = _distance(c)
-    if tells == SLOPES and parts is not None and c.distance < NEAR:
+    if tells == SLOPES and parts is not None and not expected and c.distance < NEAR:
         # What was too large once in a direction of no step would be taken for the top.
-        c.information, c.rough = _outer_products(parts, size, c.bent), True
+        c.information, c.rough = parts.information(size, c.bent), True
         c.distance = _distance(c)
     c.ended = c.distance < GOOD and tells == FINE and not missing.any()
     wanted = np.where(missing, 0.1 * c.size, _sizes(c.information))
@@ -268,56 +279,6 @@ def _slopes(middle: float, up: np.ndarray, down: np.ndarray, h: np.ndarray) -> n
         one_sided = np.where(np.isfinite(up), up - middle, middle - down) / h
         both = (up - down) / (2.0 * h)
     return np.where(np.isfinite(both), both, one_sided)
-
-
-def parts_of(
-    increments: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, log_prior: np.ndarray
-) -> np.ndarray:  # fmt: skip
-    """(B, R + 1) the R increments of a log-likelihood and the log prior density, which is no
-    increment: its slopes' outer products tell nothing. -inf where that is.
-
-    increments : (B', P) parameter vectors -> (B', R). theta : (B, P). log_prior : (B,).
-    """
-    inside = log_prior > -np.inf
-    if not inside.any():
-        return np.full((len(theta), 1), -np.inf)
-    rows = increments(theta[inside])
-    out = np.full((len(theta), rows.shape[1] + 1), -np.inf)
-    out[inside] = np.column_stack([rows, log_prior[inside]])
-    return out
-
-
-def summed(values: np.ndarray) -> np.ndarray:
-    """(B,) of values, or of the parts (B, R) of sums; -inf where a part is none."""
-    if values.ndim == 1:
-        return values
-    total: np.ndarray = values.sum(axis=1)
-    return np.where(np.isfinite(total), total, -np.inf)
-
-
-def _outer_products(parts: np.ndarray, h: np.ndarray, bent: np.ndarray) -> np.ndarray:
-    """(F, F) the sum over parts of the products of their slopes, from those (1 + F, R) at a point
-    and beside it, or (1 + 2 F, R) at both sides; of the last part `bent` (F,) instead."""
-    n = len(h)
-    middle, up, down = parts[0], parts[1 : n + 1], parts[n + 1 :]
-    with np.errstate(invalid="ignore"):
-        slopes = (up - middle) / h[:, None]
-        if len(down):
-            one_sided = np.where(np.isfinite(slopes), slopes, (middle - down) / h[:, None])
-            slopes = (up - down) / (2.0 * h)[:, None]
-            slopes = np.where(np.isfinite(slopes), slopes, one_sided)
-    slopes = np.where(np.isfinite(slopes), slopes, 0.0)[:, :-1]
-    found: np.ndarray = slopes @ slopes.T
-    return found + np.diag(bent)
-
-
-def _bent(parts: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """(F,) minus the second differences of the last part, from the parts (1 + 2 F, R) at a point
-    and at both sides of it; 0 where they are not positive."""
-    n, last = len(h), parts[:, -1]
-    with np.errstate(invalid="ignore"):
-        found = (2.0 * last[0] - last[1 : n + 1] - last[n + 1 :]) / h**2
-    return np.where(found > 0.0, found, 0.0)
 
 
 def _updated(

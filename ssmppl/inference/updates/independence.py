@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +20,8 @@ from scipy.special import gammaln
 
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.batched.extended import Extended
-from ssmppl.inference.optimisation.batched_newton import climb_together, parts_of, summed
+from ssmppl.inference.optimisation.batched_newton import climb_together
+from ssmppl.inference.optimisation.parts import Parts, parts_of, summed
 from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.problem import Problem
 
@@ -196,16 +198,17 @@ def targets(
     none."""
     theta, parts = _parts(space, model, z)
     total = summed(parts)
-    likelihood = np.where(parts[:, -1] > -np.inf, parts[:, :-1].sum(axis=1), -np.inf)
+    rows = parts.rows
+    likelihood = np.where(rows[:, -1] > -np.inf, rows[:, :-1].sum(axis=1), -np.inf)
     return theta, total, likelihood
 
 
-def _parts(space: Space, model: Extended, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """theta (B, P), and the parts (B, R + 1) of the log posterior density (`parts_of`)."""
+def _parts(space: Space, model: Extended, z: np.ndarray) -> tuple[np.ndarray, Parts]:
+    """theta (B, P), and the parts of the log posterior density."""
     found = [(t.copy(), log_prior) for t, log_prior in map(space.parameters, z)]
     theta = np.array([t for t, _ in found]).reshape(len(z), -1)
     prior, data = np.array([p for _, p in found]), space.problem.experiments
-    return theta, parts_of(lambda each: model.increments(data, each), theta, prior)
+    return theta, parts_of(partial(model.increments_and_predictions, data), theta, prior)
 
 
 def mode_of(space: Space, model: Extended, rng: np.random.Generator) -> Any:
@@ -217,7 +220,7 @@ def mode_of(space: Space, model: Extended, rng: np.random.Generator) -> Any:
     """
     z = space.z[space.positions]
 
-    def density(points: np.ndarray) -> np.ndarray:
+    def density(points: np.ndarray) -> Parts:
         return _parts(space, model, points)[1]
 
     points = np.vstack([z, z + SPREAD * rng.standard_normal((ROUND_START, len(z)))])

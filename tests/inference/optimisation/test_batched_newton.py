@@ -8,9 +8,9 @@ from ssmppl.inference.optimisation.batched_newton import (
     NEAR,
     climb_together,
     information_at,
-    summed,
 )
 from ssmppl.inference.optimisation.newton import bfgs_update
+from ssmppl.inference.optimisation.parts import Parts, summed
 
 H = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, -0.3], [0.2, -0.3, 0.7]])
 TOP = np.array([0.4, -0.2, 0.1])
@@ -66,7 +66,7 @@ def regression(rows=400):
 
     def parts(z):
         eta = z @ x.T
-        return np.column_stack([y * eta - np.exp(eta), -0.125 * np.sum(z**2, axis=1)])
+        return Parts(np.column_stack([y * eta - np.exp(eta), -0.125 * np.sum(z**2, axis=1)]))
 
     def information(z):
         return (x * np.exp(x @ z)[:, None]).T @ x + 0.25 * np.eye(3)
@@ -107,7 +107,7 @@ def test_a_part_without_a_value_is_none():
 
     def cut(z):
         out = function(z)
-        out[z[:, 0] > 0.41] = -np.inf
+        out.rows[z[:, 0] > 0.41] = -np.inf
         return out
 
     found = climb_together(cut, np.array([[0.409, 0.0, 0.0]]), precise=False)
@@ -129,7 +129,7 @@ def test_a_prior_counts_with_its_second_derivatives():
 
     def parts(z):
         rows = -0.5 * (z[:, :1] - np.linspace(-1.0, 3.0, 20)) ** 2
-        return np.column_stack([rows, -0.5 * 7.0 * z[:, 1] ** 2])
+        return Parts(np.column_stack([rows, -0.5 * 7.0 * z[:, 1] ** 2]))
 
     found = climb_together(parts, np.zeros((1, 2)), precise=False)
     assert found.information[1, 1] == pytest.approx(7.0, rel=1e-6)
@@ -141,7 +141,7 @@ def residuals(z):
     y = np.random.default_rng(3).normal(2.0, 1.5, 200)
     with np.errstate(over="ignore"):
         rows = -z[:, 1:] - 0.5 * (y - z[:, :1]) ** 2 * np.exp(-2.0 * z[:, 1:])
-    return np.column_stack([rows, np.zeros(len(z))])
+    return Parts(np.column_stack([rows, np.zeros(len(z))]))
 
 
 def points_of(starts, monkeypatch, **constants):
@@ -191,7 +191,7 @@ def test_a_climb_goes_on_to_the_top_of_a_long_ridge():
         total, apart = z[:, 0] + z[:, 1], z[:, 0] - z[:, 1] - 1.0
         across = np.expm1(total) - total  # about total^2 / 2
         rows = -k * 40.0 * across[:, None] - 0.005 * k * apart[:, None] ** 2
-        return np.column_stack([rows, np.zeros(len(z))])
+        return Parts(np.column_stack([rows, np.zeros(len(z))]))
 
     found = climb_together(parts, np.array([[-0.4, 0.7]]), precise=False)
     assert -summed(parts(found.z[None]))[0] < 5.0 * NEAR
