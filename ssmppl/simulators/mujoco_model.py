@@ -46,11 +46,11 @@ REASONS = (
 class _Quiet:
     """While any call is inside the engine's warnings, which become NaN with a reason, are not
     printed or written to a file as well; and it does not look at the clock for its own profile,
-    which of a small model takes a quarter of a step, unless the user has set a clock."""
+    which of a small model takes a quarter of a step."""
 
     def __init__(self) -> None:
-        self._lock, self._inside, self._before = threading.Lock(), 0, None
-        self._clock, self._stopped = None, False
+        self._lock, self._inside = threading.Lock(), 0
+        self._before, self._clock_before, self._clock = None, None, None
 
     @contextmanager
     def within(self, engine: Any) -> Iterator[None]:
@@ -58,10 +58,9 @@ class _Quiet:
             if not self._inside:
                 self._before = engine.get_mju_user_warning()
                 engine.set_mju_user_warning(_ignore)
-                self._stopped = engine.get_mjcb_time() is None
-                if self._stopped:
-                    self._clock = self._clock or _stopped_clock()
-                    engine.set_mjcb_time(self._clock)
+                self._clock_before = engine.get_mjcb_time()
+                self._clock = self._clock or _stopped_clock()
+                engine.set_mjcb_time(self._clock)
             self._inside += 1
         try:
             yield
@@ -70,8 +69,7 @@ class _Quiet:
                 self._inside -= 1
                 if not self._inside:
                     engine.set_mju_user_warning(self._before)
-                    if self._stopped:
-                        engine.set_mjcb_time(None)
+                    engine.set_mjcb_time(self._clock_before)
 
 
 def _ignore(text: Any) -> None:

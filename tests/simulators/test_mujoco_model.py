@@ -274,6 +274,31 @@ def test_where_it_diverges_the_result_is_nan_with_a_reason(pendulum, tmp_path, m
     assert np.array_equal(pendulum.step(state[:1], inputs[:1], parameters[:1]), found[:1])
 
 
+def test_the_clock_of_the_engine_stands_still_within_a_call_alone(pendulum, monkeypatch):
+    engine, set_to = pendulum.moves.function.engine, []
+    at = np.zeros((2, 2)), np.zeros((2, 2)), np.array([[0.1, 0.7]] * 2)
+    was, original = pendulum.step(*at), engine.set_mjcb_time
+    assert engine.get_mjcb_time() is None
+
+    def kept(clock):
+        set_to.append(clock)
+        original(clock)
+
+    monkeypatch.setattr(engine, "set_mjcb_time", kept)
+    pendulum.step(*at)
+    assert [c and c() for c in set_to] == [0.0, None]
+
+    def own():
+        return 1.0
+
+    original(own)
+    try:
+        assert np.array_equal(pendulum.step(*at), was)
+        assert engine.get_mjcb_time() is own
+    finally:
+        original(None)
+
+
 def test_activations_are_states_and_controls_of_actuators_inputs():
     simulator = mujoco(machine(), substeps=1)
     assert simulator.state[-1] == "slow_activation"

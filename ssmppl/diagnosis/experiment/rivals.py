@@ -37,6 +37,7 @@ from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.newton import climb
+from ssmppl.inference.optimisation.parts import Predictions
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
 
@@ -193,7 +194,7 @@ class _Model:
         return (value if np.isfinite(value) else np.nan) - 0.5 * len(z), after
 
     def _log_likelihood(self, data: Sequence[Experiment], theta: np.ndarray) -> float:
-        found = float(increments(self.fitter, data, theta[None]).sum())
+        found = float(increments(self.fitter, data, theta[None])[0].sum())
         return found + len(data) * self.fitter.log_correction
 
 
@@ -204,14 +205,18 @@ def has_filter(fitter: Fitter) -> bool:
     return fitter.exact or isinstance(gaussian, GaussianApproximation)
 
 
-def increments(fitter: Fitter, data: Sequence[Experiment], theta: np.ndarray) -> np.ndarray:
+def increments(
+    fitter: Fitter, data: Sequence[Experiment], theta: np.ndarray
+) -> tuple[np.ndarray, Predictions | None]:
     """(B, R) the increments of the log-likelihood at theta (B, P) in the R rows of all experiments,
-    by the Kalman filter; -inf where it comes to no number."""
+    by the Kalman filter, -inf where it comes to no number; and its predictions where a simulator is
+    called."""
     called = extended_model(fitter.problem.trace)
     if isinstance(called, Extended):  # a simulator takes many points at once
         with thriftily():
-            return called.increments(data, theta)
-    return np.stack([np.concatenate([_rows(fitter, e, one) for e in data]) for one in theta])
+            return called.increments_and_predictions(data, theta)
+    rows = [np.concatenate([_rows(fitter, e, one) for e in data]) for one in theta]
+    return np.stack(rows), None
 
 
 def _rows(fitter: Fitter, e: Experiment, theta: np.ndarray) -> np.ndarray:

@@ -30,7 +30,6 @@ WINDOW = 0.1  # of the longest record: the rows of a simulation that is looked a
 LEAST_RECORDS = 8  # of the longest record, as many times as long as a horizon that counts
 SETTLING = 0.02  # of a record: the first rows, in which the filter may not know the state yet
 ORIGINS = 60  # rows that are simulated on from, of each experiment at most
-ORIGINS_CALLED = 8  # likewise, where a simulator is called
 DRAWS = 128  # from each
 LEAST_SQUARE = (
     1e-12  # of an error, and least variance, in squares of the spread of what is measured
@@ -98,7 +97,7 @@ def look_ahead(
     SamplingError : the filter fails at the fit.
     """
     called = isinstance(fitter.smoother.extended, Extended)
-    feedback, number = feeds_back(fitter.problem.trace), ORIGINS_CALLED if called else ORIGINS
+    feedback = feeds_back(fitter.problem.trace)
     draws, spread = CRPS_DRAWS_CALLED if called else DRAWS, _spread(experiments)
     channels = len(spread)
 
@@ -109,7 +108,7 @@ def look_ahead(
             return np.empty((0, reach, channels)), np.empty((0, reach))
         settled = round(SETTLING * e.steps)
         first, last = max(int(rows[0]) - 1, settled), max(int(rows[-1]) - 1, settled)
-        origins = np.unique(np.linspace(first, last, number).astype(int))
+        origins = np.unique(np.linspace(first, last, ORIGINS).astype(int))
         particles, weights = fitter.smoother.filtered_draws(e, fit.theta, stream)
         samples = samples_ahead(
             fitter.smoother.program, e, fit.theta, particles, weights, stream, feedback, origins,
@@ -192,9 +191,7 @@ class SimulationGain:
         rows = np.sum([(e.seen == 1.0).sum(axis=0) for e in train], axis=0)
         nothing = np.full((len(horizons) + 1, len(rows)), np.nan)
         reach = min(window or max(1, round(WINDOW * longest)), max(longest // 2, 1))
-        called = isinstance(fitter.smoother.extended, Extended)
-        origins = (ORIGINS_CALLED if called else ORIGINS) * len(train)
-        out = cls(horizons, reach, rows, nothing, seed, origins)
+        out = cls(horizons, reach, rows, nothing, seed, ORIGINS * len(train))
         return replace(out, before=out.mean_squares(fitter, fit, train))
 
     def gain(self, after: np.ndarray) -> float:

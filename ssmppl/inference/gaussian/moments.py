@@ -195,7 +195,7 @@ class ApproximateKalman:
 
 
 def _gains(found: FilterMoments) -> np.ndarray:
-    """Gains (T, D, D) of each row: how x_{t-1} goes with x_t less its prediction; 0 of the first."""
+    """Gains (T, D, D): how x_{t-1} goes with x_t less its prediction; 0 in the first row."""
     out = np.zeros_like(found.cross)
     covariance = found.predicted_covariance[1:]
     scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))

@@ -249,11 +249,11 @@ def test_increments_add_up_to_the_likelihood_of_all_experiments():
     theta = theta_of(fitter, rival)
     data = [replace(e, y=e.u.copy()), e]
     assert has_filter(fitter)
-    found = increments(fitter, data, np.stack([theta, 1.01 * theta]))
+    found, _ = increments(fitter, data, np.stack([theta, 1.01 * theta]))
     assert found.shape == (2, 2 * ROWS)
     assert found[0].sum() == pytest.approx(fitter.value(data, theta))
     assert found[1].sum() != pytest.approx(found[0].sum())
-    first = increments(fitter, [data[0]], theta[None])
+    first, _ = increments(fitter, [data[0]], theta[None])
     np.testing.assert_allclose(first[0], found[0, :ROWS])
     exact = fitter.kalman.filter(data[0], theta).log_increments
     np.testing.assert_allclose(first[0], exact, rtol=1e-6, atol=1e-9)

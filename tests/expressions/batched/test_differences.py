@@ -134,3 +134,55 @@ def test_central_differences_come_back_afterwards():
         with thriftily() if within else nullcontext():
             computed(Counted(), ((), (0,)), np.array([[-0.5]]))
     assert asked == [3, 2, 3]
+
+
+class Cubed:
+    """x^3, and the points that it is asked for."""
+
+    name, scales, outputs = "cubed", np.ones(1), 1
+
+    def __init__(self):
+        self.asked = []
+
+    def at(self, points):
+        self.asked.append(len(points))
+        return points**3
+
+
+def test_draws_round_one_point_share_its_derivatives():
+    x, function = np.array([[0.9], [1.0], [1.1], [1.2]]), Cubed()
+    middle = x.mean()
+    with thriftily(alike=True):
+        value, slope = computed(function, ((), (0,)), x)
+        np.testing.assert_allclose(value[0], x[:, 0] ** 3)
+        np.testing.assert_allclose(slope[0], 3.0 * middle**2, rtol=1e-6)
+        assert sum(function.asked) == 4 + 2
+        again, bend = computed(function, ((), (0, 0)), x)  # the values are known by now
+        assert sum(function.asked) == 4 + 2 + 2
+        np.testing.assert_array_equal(again, value)
+        np.testing.assert_allclose(bend[0], 6.0 * middle, rtol=1e-3)
+        slope = computed(function, ((0,),), x[:1])[0]  # a point alone has its own
+        assert slope[0] == pytest.approx(3.0 * 0.9**2, rel=1e-6)
+    slope = computed(function, ((0,),), x)[0]
+    np.testing.assert_allclose(slope[0], 3.0 * x[:, 0] ** 2, rtol=1e-6)
+
+
+def test_each_has_its_own_where_there_is_none_in_the_middle():
+    class Gap(Cubed):
+        def at(self, points):
+            return np.where(np.abs(points) < 0.5, np.nan, points**3)
+
+    x = np.array([[-1.0], [1.1]])
+    with thriftily(alike=True):
+        slope = computed(Gap(), ((0,),), x)[0]
+    np.testing.assert_allclose(slope[0], 3.0 * x[:, 0] ** 2, rtol=1e-6)
+
+
+def test_within_another_thrifty_part_the_outer_one_goes_on():
+    x, function = np.array([[0.9], [1.1]]), Cubed()
+    with thriftily(alike=True):
+        with thriftily():
+            slope = computed(function, ((0,),), x)[0]
+            np.testing.assert_allclose(slope[0], 3.0 * x[:, 0] ** 2, rtol=1e-6)
+        slope = computed(function, ((0,),), x)[0]
+        np.testing.assert_allclose(slope[0], 3.0, rtol=1e-6)

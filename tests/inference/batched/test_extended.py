@@ -137,6 +137,26 @@ class TestLinear:
         ]
         np.testing.assert_allclose(found, known, atol=1e-7)
 
+    @pytest.mark.parametrize("data", [DATA, GAPS, SEVERAL], ids=["whole", "gaps", "several"])
+    def test_predictions_are_those_of_the_kalman_filter(self, linear, exact, data):
+        problem = pose(linear, data)
+        theta = np.array([[0.8, 0.5, 0.3], [2.0, 0.1, 0.1]])
+        model = extended_model(problem.trace)
+        rows, found = model.increments_and_predictions(problem.experiments, theta)
+        np.testing.assert_array_equal(rows, model.increments(problem.experiments, theta))
+        for k, at in enumerate(theta):
+            begin = 0
+            for e, own in zip(
+                problem.experiments, data if data is SEVERAL else [data], strict=True
+            ):
+                known = ssm.kalman_filter(exact, own, dict(zip(AT, at, strict=True)))
+                part, begin = slice(begin, begin + e.steps), begin + T  # all are as long as one
+                y, seen = e.y[:, 0], e.seen[:, 0] == 1.0
+                error = np.where(seen, y - known["y_predicted"].values.ravel(), 0.0)
+                sd = np.where(seen, known["y_predicted_sd"].values.ravel(), 1.0)
+                np.testing.assert_allclose(found.error[k, part, 0], error, atol=1e-7)
+                np.testing.assert_allclose(found.covariance[k, part, 0, 0], sd**2, atol=1e-7)
+
     def test_score_and_information(self, linear, exact):
         found, known = (ssm.score(m, DATA, AT) for m in (linear, exact))
         scale = np.sqrt(np.diagonal(known.information))
@@ -215,6 +235,18 @@ def test_observations_of_other_kinds(observe, kind):
     found = extended_model(problem.trace).log_likelihoods(problem.experiments, theta)
     # Newton's steps end where they gain less than 0.05 nats a row: both at the same place
     np.testing.assert_allclose(found, known, atol=1e-6)
+
+
+@pytest.mark.parametrize("observe", [counts, heavy])
+def test_what_is_not_gaussian_has_no_gaussian_predictions(observe):
+    data = simulated(3, counts=observe is counts)
+    problem = pose(model_of(called, observe), data)
+    model = extended_model(problem.trace)
+    rows, predictions = model.increments_and_predictions(
+        problem.experiments, np.array([[0.8, 0.5, 0.3]])
+    )
+    assert predictions is None
+    assert np.isfinite(rows).all()
 
 
 def test_a_lane_that_comes_to_no_number_leaves_the_others_alone(linear):
