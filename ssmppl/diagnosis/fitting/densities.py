@@ -27,6 +27,11 @@ def density_of(
     return value
 
 
+def one_by_one(function: Callable[[np.ndarray], float]) -> Callable[[np.ndarray], np.ndarray]:
+    """The function z (F,) -> value of many points (B, F) -> (B,)."""
+    return lambda points: np.array([function(z) for z in points])
+
+
 def densities_of(space: Space, increments: Increments) -> Callable[[np.ndarray], Parts]:
     """As `density_of`, of many points z (B, F) at once, by parts."""
 

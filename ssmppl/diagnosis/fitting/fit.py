@@ -20,7 +20,12 @@ import numpy as np
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.fitting.bounds import flat_outwards, hold_at_bounds
-from ssmppl.diagnosis.fitting.densities import best_of_many, densities_of, density_of
+from ssmppl.diagnosis.fitting.densities import (
+    best_of_many,
+    densities_of,
+    density_of,
+    one_by_one,
+)
 from ssmppl.diagnosis.fitting.noisy_ascent import NEAR, stochastic_quasi_newton
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
@@ -288,7 +293,8 @@ class Fitter:
         assert fit is not None
         if effort.approximate:
             return fit
-        z, mask = hold_at_bounds(density_of(space, smooth), fit.z, ~space.on_the_line)
+        values = one_by_one(density_of(space, smooth))
+        z, mask = hold_at_bounds(values, fit.z, ~space.on_the_line)
         if not mask.any():
             return fit
         theta = space.parameters(z)[0].copy()
@@ -380,7 +386,7 @@ class Fitter:
         if effort.approximate:
             return fit
         level = flat_outwards(densities, fit.z) & ~there.on_the_line
-        z, mask = hold_at_bounds(density_of(there, smooth), fit.z, level)
+        z, mask = hold_at_bounds(lambda points: summed(densities(points)), fit.z, level)
         if not mask.any():
             return fit
         theta = there.parameters(z)[0].copy()
@@ -480,7 +486,7 @@ class Fitter:
             theta, converged = ascent.theta, bool(ascent.report["converged"])
         else:
             theta, converged = space.theta, True
-        z, mask = hold_at_bounds(function, setup.space_at(theta), ~space.on_the_line)
+        z, mask = hold_at_bounds(one_by_one(function), setup.space_at(theta), ~space.on_the_line)
         theta = space.parameters(z)[0].copy() if mask.any() else theta
         value = kalman.log_likelihood(problem.experiments, theta)
         size = len(space.positions)

@@ -227,12 +227,10 @@ def _take(c: Climber, found: Values, tells: int, move: np.ndarray | None = None)
             up, down = np.split(values[1:], 2)
             slope = _slopes(values[0], up, down, size)
         curvature = -c.information
-        if expected:
-            pass
-        elif move is not None:
+        if move is not None and not expected:
             curvature = -_updated(c.information, move, c.slope - slope, c.rough)
             c.rough = False
-        elif parts is not None:
+        elif parts is not None and not expected:
             curvature, c.rough = -parts.information(size, c.bent), True
         c.stale = not np.all(np.isfinite(slope))
         c.by_parts = c.stale and tells == FORWARD and parts is not None

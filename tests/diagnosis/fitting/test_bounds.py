@@ -7,6 +7,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.fitting.bounds import COST, bounds_note, flat_outwards, hold_at_bounds
+from ssmppl.diagnosis.fitting.densities import one_by_one
 from ssmppl.diagnosis.fitting.fit import FROM_START, Fitter, standard_errors
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.inference.run.problem import pose
@@ -22,14 +23,15 @@ def test_a_scale_that_counts_for_nothing_is_held_next_to_where_it_counts(z):
     def function(z):
         return -np.log1p(np.exp(2.0 * z[0])) - 0.5 * (z[1] - 3.0) ** 2
 
-    z, mask = hold_at_bounds(function, np.array([z, 3.0]), np.array([True, False]))
+    z, mask = hold_at_bounds(one_by_one(function), np.array([z, 3.0]), np.array([True, False]))
     assert mask.tolist() == [True, False]
     assert np.exp(z[0]) == pytest.approx(np.sqrt(np.expm1(COST)), rel=1e-3)
     assert z[1] == 3.0
 
 
 def test_an_upper_bound_is_one_too():
-    z, mask = hold_at_bounds(lambda z: -np.log1p(np.exp(-z[0])), np.array([20.0]), np.array([True]))
+    function = one_by_one(lambda z: -np.log1p(np.exp(-z[0])))
+    z, mask = hold_at_bounds(function, np.array([20.0]), np.array([True]))
     assert mask.all()
     assert np.log1p(np.exp(-z[0])) == pytest.approx(COST, rel=1e-3)
 
@@ -40,7 +42,7 @@ def test_an_upper_bound_is_one_too():
     ids=["a top inside", "flat", "a wide top inside"],
 )
 def test_what_is_at_no_bound_is_left(function):
-    z, mask = hold_at_bounds(function, np.array([0.4]), np.array([True]))
+    z, mask = hold_at_bounds(one_by_one(function), np.array([0.4]), np.array([True]))
     assert not mask.any()
     assert z[0] == 0.4
 
@@ -54,10 +56,24 @@ def test_what_falls_at_the_first_step_outwards_is_at_no_bound():
         return -np.log1p(np.exp(z[0])) - np.log1p(np.exp(-z[1])) - 0.5 * z[2] ** 2 - off
 
     z = np.array([-20.0, 20.0, 0.0, 0.2])
-    level = flat_outwards(lambda points: np.array([one(p) for p in points]), z)
+    level = flat_outwards(one_by_one(one), z)
     assert level.tolist() == [True, True, False, False]
-    _, mask = hold_at_bounds(one, z, np.ones(4, dtype=bool))
+    _, mask = hold_at_bounds(one_by_one(one), z, np.ones(4, dtype=bool))
     assert mask.tolist() == level.tolist()
+
+
+def test_many_points_are_looked_at_in_a_call():
+    """As of a simulator, where a call of many takes little longer than of one."""
+    calls = []
+
+    def function(points):
+        calls.append(len(points))
+        return -np.log1p(np.exp(2.0 * points[:, 0]))
+
+    _, mask = hold_at_bounds(function, np.array([-27.0]), np.array([True]))
+    assert mask.all()
+    assert len(calls) < 15
+    assert sum(calls) < 150
 
 
 def fits(model, y, exact=True):
