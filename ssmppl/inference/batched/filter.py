@@ -46,22 +46,28 @@ class Moments:
 
 
 class BatchedFilter:
-    """The filter of a model. found : the model by its noises."""
+    """The filter of a model. found : the model by its noises.
+
+    States that follow from parameters and inputs alone, as the line of an input's delay, are moved
+    and have no covariance: the filter is of the others, of whom there are N.
+    """
 
     def __init__(self, trace: Trace, found: LookaheadModel):
         self.trace, self.flat = trace, found.flat
         d = self.size = len(trace.state_symbols)
         first, later = found.initial, found.transition
-        half = [found.curvature[i, j] for i in range(d) for j in range(i + 1)]
-        place = np.zeros((d, d), dtype=int)  # of each entry of a curvature among these
-        place[np.tril_indices(d)] = np.arange(len(half))
+        self.own = own = _uncertain(found, trace)
+        n, both = len(own), np.ix_(own, own)
+        slope, curvature = jacobian(later, trace)[both], found.curvature[both]
+        half = [curvature[i, j] for i in range(n) for j in range(i + 1)]
+        place = np.zeros((n, n), dtype=int)  # of each entry of a curvature among these
+        place[np.tril_indices(n)] = np.arange(len(half))
         self._half = np.maximum(place, place.T).ravel()
-        self._begin = _Part(trace, [*first.at_rest(), *first.spread().ravel()])
-        self._move = _Part(
-            trace, [*later.at_rest(), *jacobian(later, trace).ravel(), *later.spread().ravel()]
-        )
-        self._look = _Part(trace, [found.observed, *found.slope, *half])
-        self._predict = _gaussian_observation(trace)
+        self._begin = _Part(trace, [*first.at_rest(), *first.spread()[own].ravel()])
+        self._move = _Part(trace, [*later.at_rest(), *slope.ravel(), *later.spread()[own].ravel()])
+        self._look = _Part(trace, [found.observed, *found.slope[own], *half])
+        self._predict = _gaussian_observation(trace, own)
+        self._everywhere = n == d
 
     def log_likelihoods(
         self, experiments: Sequence[Experiment], theta: np.ndarray,
@@ -118,7 +124,7 @@ class BatchedFilter:
                     seen.append(self._predict(lanes, rest, p))
                 increment, x, covariance = self._updated(lanes, rest, p)
                 after, before = (np.einsum("lii->li", c) for c in (covariance, p))
-                fine = (after >= RESOLVED * before) & np.isfinite(x)
+                fine = (after >= RESOLVED * before) & np.isfinite(x[:, self.own])
                 going = lanes.going
                 if not (fine.all() and np.isfinite(increment).all()):
                     dead |= ~(fine.all(axis=1) & np.isfinite(increment)) & going
@@ -126,7 +132,8 @@ class BatchedFilter:
                         break
                 out[:, t] = increment if going is True else np.where(going, increment, 0.0)
                 if record is not None:
-                    record.append(Moments(x, covariance, rest, p, cross))
+                    after, before, cross = map(self._embedded, (covariance, p, cross))
+                    record.append(Moments(x, after, rest, before, cross))
                 if dead.any():  # in place of what is no number
                     alive = int(np.argmin(dead))
                     x = np.where(dead[:, None], x[alive], x)
@@ -135,36 +142,53 @@ class BatchedFilter:
         return lanes.of_vectors(out)
 
     def _started(self, lanes: _Lanes) -> tuple[np.ndarray, np.ndarray]:
-        d = self.size
+        d, n = self.size, len(self.own)
         values = self._begin(lanes, None, None)
-        return values[:, :d], values[:, d:].reshape(len(values), d, -1)
+        return values[:, :d], values[:, d:].reshape(len(values), n, -1)
 
     def _moved(self, lanes: _Lanes, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        d = self.size
+        d, n = self.size, len(self.own)
         values = self._move(lanes, None, x)
-        n = len(values)
-        slope = values[:, d : d + d * d].reshape(n, d, d)
-        return values[:, :d], slope, values[:, d + d * d :].reshape(n, d, -1)
+        slope, spread = values[:, d : d + n * n], values[:, d + n * n :]
+        count = len(values)
+        return values[:, :d], slope.reshape(count, n, n), spread.reshape(count, n, -1)
+
+    def _moved_on(self, rest: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """States (L, D), those of the filter moved by (L, N)."""
+        if self._everywhere:
+            return rest + by
+        out = rest.copy()
+        out[:, self.own] += by
+        return out
+
+    def _embedded(self, covariance: np.ndarray) -> np.ndarray:
+        """(L, D, D) of one (L, N, N), 0 of states that are known."""
+        if self._everywhere:
+            return covariance
+        out = np.zeros((len(covariance), self.size, self.size))
+        rows, columns = np.ix_(self.own, self.own)
+        out[:, rows, columns] = covariance
+        return out
 
     def _seen(self, lanes: _Lanes, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """log g (L,), its slope (L, D) and minus its curvature (L, D, D), not negative."""
-        d = self.size
+        """log g (L,), its slope (L, N) and minus its curvature (L, N, N), not negative."""
+        n = len(self.own)
         values = self._look(lanes, x, None)
-        h = values[:, 1 + d + self._half].reshape(-1, d, d)
+        h = values[:, 1 + n + self._half].reshape(-1, n, n)
         if not self.flat:
             h = _positive_part(h)
-        return values[:, 0], values[:, 1 : 1 + d], h
+        return values[:, 0], values[:, 1 : 1 + n], h
 
     def _updated(
         self, lanes: _Lanes, rest: np.ndarray, p: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Increments (L,) of the log-likelihood, means (L, D) and covariances (L, D, D) after."""
+        """Increments (L,) of the log-likelihood, means (L, D) and covariances (L, N, N) after."""
         height, g, h = self._seen(lanes, rest)
-        log_det, after, move = _step(p, h, g, np.zeros_like(rest))
+        log_det, after, move = _step(p, h, g, np.zeros_like(g))
         if self.flat:  # quadratic: one step, whose gain is known
             # log g at the mode, less (g - H move)' move / 2, the prior's part
             gained = 0.5 * np.einsum("li,li->l", g, move)
-            return height + gained - 0.5 * log_det, rest + move, after
+            return height + gained - 0.5 * log_det, self._moved_on(rest, move), after
         return self._climbed(lanes, rest, p, (height, g, h), (log_det, after, move))
 
     def _climbed(
@@ -173,7 +197,7 @@ class BatchedFilter:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """Newton's method, each lane with its own share of a step and its own end."""
         (height, g, h), (log_det, after, move) = seen, step
-        toward, lead = np.zeros_like(rest), np.zeros_like(rest)
+        toward, lead = np.zeros_like(g), np.zeros_like(g)
         active = np.ones(len(rest), dtype=bool)
         for _ in range(NEWTON_STEPS):
             target = g + np.einsum("lij,lj->li", h, toward - move)
@@ -184,7 +208,7 @@ class BatchedFilter:
             for _ in range(HALVINGS):
                 gone = toward + share[:, None] * (move - toward)
                 ahead = lead + share[:, None] * (target - lead)
-                value = self._seen(lanes, rest + gone)[0]
+                value = self._seen(lanes, self._moved_on(rest, gone))[0]
                 new = value - 0.5 * np.sum(ahead * gone, axis=1)
                 better = (new >= height) | (np.isfinite(new) & ~np.isfinite(height))
                 taken = waiting & better
@@ -196,7 +220,7 @@ class BatchedFilter:
             went = (share * found)[:, None]
             lead, toward = lead + went * (target - lead), toward + went * (move - toward)
             gained, height = best - height, best
-            _, g_new, h_new = self._seen(lanes, rest + toward)
+            _, g_new, h_new = self._seen(lanes, self._moved_on(rest, toward))
             g = np.where(found[:, None], g_new, g)
             h = np.where(found[:, None, None], h_new, h)
             new_det, new_after, new_move = _step(p, h, g, toward)
@@ -206,7 +230,23 @@ class BatchedFilter:
             active &= found & ~(gained < CLOSE)
             if not active.any():
                 break
-        return height - 0.5 * log_det, rest + toward, after
+        return height - 0.5 * log_det, self._moved_on(rest, toward), after
+
+
+def _uncertain(found: LookaheadModel, trace: Trace) -> np.ndarray:
+    """(N,) the places of the states that parameters and data up to a row do not determine."""
+    initial, later = found.initial, found.transition
+    uncertain = {
+        k for form in (initial, later) for k, e in enumerate(form.value)
+        if depends_on(e, form.noise)
+    }  # fmt: skip
+    before = dict(enumerate(trace.state_prev_symbols))
+    while True:
+        sources = [before[k] for k in uncertain]
+        more = {k for k, e in enumerate(later.value) if depends_on(e, sources)} - uncertain
+        if not more:
+            return np.array(sorted(uncertain), dtype=int)
+        uncertain |= more
 
 
 class _Part:
@@ -254,35 +294,36 @@ _Seen = tuple[np.ndarray, np.ndarray]  # of one row, in each lane: as of `Predic
 
 
 class _GaussianObservation:
-    """What is observed, as mean (K,) and noise about it, and by the states (K, D)."""
+    """What is observed, as mean (K,) and noise about it, and by the filter's states (K, N)."""
 
     def __init__(self, trace: Trace, mean: Sequence[Expr], slope: np.ndarray, spread: np.ndarray):
-        self.channels, self.states = slope.shape
-        self.trace = trace
+        self.shape = slope.shape
         self._part = _Part(trace, [*mean, *slope.ravel(), *spread.ravel()])
 
     def __call__(self, lanes: _Lanes, rest: np.ndarray, p: np.ndarray) -> _Seen:
-        """The predictions of a row from the mean (L, D) and covariance (L, D, D) of its states."""
-        k, d = self.channels, self.states
+        """The predictions of a row from the mean (L, D) and covariance (L, N, N) of its states."""
+        k, n = self.shape
         values = self._part(lanes, rest, None)
-        mean, slope = values[:, :k], values[:, k : k + k * d].reshape(-1, k, d)
-        spread = values[:, k + k * d :].reshape(len(values), k, -1)
+        mean, slope = values[:, :k], values[:, k : k + k * n].reshape(-1, k, n)
+        spread = values[:, k + k * n :].reshape(len(values), k, -1)
         covariance = slope @ p @ slope.transpose(0, 2, 1) + spread @ spread.transpose(0, 2, 1)
         y, seen = lanes.measured()
         both = seen[:, :, None] & seen[:, None, :]
         return np.where(seen, y - mean, 0.0), np.where(both, covariance, np.eye(k))
 
 
-def _gaussian_observation(trace: Trace) -> _GaussianObservation | None:
-    """None of observations that are not all driven by Gaussian noise, or look back."""
+def _gaussian_observation(trace: Trace, own: np.ndarray) -> _GaussianObservation | None:
+    """By the states at `own` (N,); None of observations that are not all driven by Gaussian noise,
+    or not by states alone."""
     form = noise_form(list(trace.observations.values()), list(trace.observation_symbols))
     if isinstance(form, NotApplicable):
         return None
     mean, spread = form.at_rest(), form.spread()
     if any(depends_on(e, trace.observation_symbols) for e in [*mean, *spread.ravel()]):
         return None  # a channel by another one of its row
+    states = [trace.state_symbols[k] for k in own]
     try:
-        slope = np.array([differentiate(list(mean), s) for s in trace.state_symbols]).T
+        slope = np.array([differentiate(list(mean), s) for s in states]).T
     except NotDifferentiable:
         return None
     return _GaussianObservation(trace, list(mean), slope, spread)

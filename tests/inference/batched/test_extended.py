@@ -249,6 +249,78 @@ def test_what_is_not_gaussian_has_no_gaussian_predictions(observe):
     assert np.isfinite(rows).all()
 
 
+def late(step):
+    """The spring, pushed two rows late and through a lag: states that the inputs determine, and one
+    beside them that looks determined and is not."""
+    model = ssm.Model("late spring", inputs=("u",))
+
+    @model.prior
+    def prior():
+        return {
+            "k": ssm.HalfNormal(sd=2), "c": ssm.HalfNormal(sd=2), "s": ssm.HalfNormal(sd=1)
+        }  # fmt: skip
+
+    @model.initial
+    def initial():
+        return {
+            "a": ssm.Dirac(0.0), "q": ssm.Normal(0, sd=0.5), "b": ssm.Dirac(0.0),
+            "lag": ssm.Dirac(0.1), "v": ssm.Normal(0, sd=0.5), "was": ssm.Dirac(0.0),
+        }  # fmt: skip
+
+    @model.transition
+    def transition(a, b, lag, q, v, u, k, c, s):
+        new = step(q, v, 0.5 * b + 0.5 * lag, k, c)
+        return {
+            "a": ssm.Dirac(u), "b": ssm.Dirac(a), "lag": ssm.Dirac(0.6 * lag + 0.4 * c * u),
+            "q": ssm.Dirac(new["q"]), "v": ssm.Normal(new["v"], sd=s), "was": ssm.Dirac(q),
+        }  # fmt: skip
+
+    @model.observation
+    def observation(q, was, lag):
+        return {"y": ssm.Normal(q + 0.3 * was + 0.1 * lag, sd=0.2)}
+
+    return model
+
+
+class TestStatesThatTheInputsDetermine:
+    """Lines of delays, and lags, of inputs have no covariance; the filter is the same."""
+
+    def test_increments_and_predictions(self):
+        ours, exact = late(called), late(written)
+        problem = pose(ours, GAPS)
+        model = extended_model(problem.trace)
+        theta = np.array([[0.8, 0.5, 0.3], [2.0, 0.1, 0.1]])
+        rows, found = model.increments_and_predictions(problem.experiments, theta)
+        names = [s.data[1] for s in problem.trace.state_symbols]
+        kept = [names[k] for k in model._filter(problem.experiments).own]
+        assert sorted(kept) == ["q", "v", "was"]
+        for k, at in enumerate(theta):
+            known = ssm.kalman_filter(exact, GAPS, dict(zip(AT, at, strict=True)))
+            np.testing.assert_allclose(
+                rows[k], known["log_likelihood_increment"].values.ravel(), atol=1e-7
+            )
+            seen = np.isfinite(GAPS["y"])
+            error = (GAPS["y"] - known["y_predicted"].values.ravel())[seen]
+            np.testing.assert_allclose(found.error[k, seen, 0], error, atol=1e-7)
+
+    def test_trajectories(self):
+        """Of each lane the determined ones are what they are, and the others have the moments of
+        the smoother."""
+        ours, exact = late(called), late(written)
+        problem = pose(ours, GAPS)
+        model = extended_model(problem.trace)
+        theta = np.repeat([[0.8, 0.5, 0.3]], 400, axis=0)
+        (e,) = problem.experiments
+        drawn = model.trajectories(e, theta, np.random.default_rng(3))
+        known = ssm.smooth(exact, GAPS, AT)
+        for k, s in enumerate(problem.trace.state_symbols):
+            name = s.data[1]
+            mean, sd = known[name].values.ravel(), known[f"{name}_sd"].values.ravel()
+            assert np.all(np.abs(drawn[:, :, k].mean(axis=0) - mean) <= 5.0 * sd / 20.0 + 1e-6)
+            spread = drawn[:, :, k].std(axis=0)
+            np.testing.assert_allclose(spread, sd, rtol=0.25, atol=1e-6)
+
+
 def test_a_lane_that_comes_to_no_number_leaves_the_others_alone(linear):
     problem = pose(linear, DATA)
     model = extended_model(problem.trace)
