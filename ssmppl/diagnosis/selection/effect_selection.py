@@ -25,6 +25,7 @@ from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.horizons import SimulationGain
+from ssmppl.diagnosis.selection.input_delays import promising_delays
 from ssmppl.diagnosis.selection.overlooked import best_start, most_promising, overlooked
 from ssmppl.diagnosis.selection.refit import (
     EXPLAINED,
@@ -47,6 +48,7 @@ AFRESH = "refitting from default start"
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is run
 CARRIES_ON = 0.1  # of what a further cause gains one row ahead, that it has to gain beyond
+PROMISING = 0.25  # of the best refit's score, by moving an input alone: then its delay is refitted
 MOST_LOST = 1.0  # nats, further ahead, by what only describes a misfit
 FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
 AGAIN_CALLED = 60  # likewise, of a model that calls a simulator
@@ -156,6 +158,7 @@ class EffectSelection:
                 screen, refits
             )
             stages["refitting other delays"] = lambda: delays(screen, refits)
+            stages["refitting delays of inputs"] = lambda: self._delayed(out, refits)
             stages[AFRESH] = lambda: one_signed_candidates(screen)
         for stage, which in stages.items():
             with self.checkpoint.failures.guard(stage):
@@ -169,6 +172,16 @@ class EffectSelection:
             with self.checkpoint.failures.guard("mechanisms that the screen overlooks"):
                 refits = best_of_groups(screen, refits + self._overlooked(out, refits))
         out.refits = refits
+
+    def _delayed(self, out: SelectionResult, refits: Sequence[Refit]) -> list[int]:
+        """The best delay of an input that moving the inputs promises and that was not refitted."""
+        done = {int(self.screen.groups[r.index[0]]) for r in refits}
+        worth = PROMISING * max((r.score for r in refits), default=0.0)
+        worth = max(worth, critical_gain(self.screen, self.alpha))
+        found = promising_delays(
+            self.augmented.base_fitter, out.base.theta, self.screen, self.train, worth
+        )
+        return [k for k in found if int(self.screen.groups[k]) not in done][:1]
 
     def _overlooked(self, out: SelectionResult, refits: Sequence[Refit]) -> list[Refit]:
         """Mechanisms where what only describes a misfit gains most."""

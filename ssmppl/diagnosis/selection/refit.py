@@ -39,6 +39,7 @@ from ssmppl.diagnosis.run.seeds import Stream, Task, child_seed
 from ssmppl.diagnosis.screening.efficient_score import Efficient
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
 from ssmppl.diagnosis.selection.horizons import SimulationGain
+from ssmppl.diagnosis.selection.input_delays import PRICE, START, best_delay, is_input_delay
 from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, fit_for_simulation, restored
 from ssmppl.errors import NotApplicable, SSMError
 from ssmppl.inference.batched.extended import Extended
@@ -161,6 +162,9 @@ def refit(
             fit = fitter.fit(train, seed, start, effort)
         else:
             start = start_at(base, screen.design, screen.efficient, index)
+            for k, c in zip(index, candidates[-len(index) :], strict=True):
+                if _of_other_length(screen, k, c):
+                    start[c.strength] = np.asarray(START)
             new = [c.strength for c in candidates[-len(index) :]]
             start = _backtracked(fitter, start, new, train, seed)
             information = None if fitter.exact else _information(fitter, screen, index, train)
@@ -317,6 +321,8 @@ def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
         c = screen.design.candidates[best]
         every = np.flatnonzero(screen.groups == screen.groups[best]).tolist()
         group = [k for k in every if k != best and not screen.efficient.status[k]]
+        if is_input_delay(c):  # every length was tried
+            continue
         if any(c.effect.states.values()) and len(out) < CORRELATED:
             out += group
         elif is_dated(c) and len(out) < CORRELATED and not called:
@@ -402,7 +408,10 @@ def refit_all(
     """The refits that came to an end, best first, and why the others did not. afresh, approximate,
     strengths (one for each set) : as of `refit`. simulation : of the model as it is, for
     `Refit.ahead`; None: that is 0."""
-    shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
+    shaped = _shaped(
+        augmented.fitter(tuple(given)), base, screen, sorted({k for s in sets for k in s}), train,
+        seed,
+    )  # fmt: skip
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
     one = partial(_one, augmented, base, screen, list(sets), tuple(train), seed, added, afresh,
@@ -426,10 +435,16 @@ def refit_all(
             )
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
+        cost += PRICE * sum(_of_other_length(screen, k, shaped[k]) for k in index)
         made = Refit(tuple(index), candidates, fitter, fit, gain, cost)
         done.append(made.simulated(train, numbers, simulation))
     done.sort(key=lambda r: -r.score)
     return done, reasons
+
+
+def _of_other_length(screen: Screen, k: int, c: Candidate) -> bool:
+    """Whether `c`, in place of the column k, is a delay of another length."""
+    return is_input_delay(c) and c.shape != screen.design.candidates[k].shape
 
 
 def _one(
@@ -453,13 +468,17 @@ def _one(
 
 
 def _shaped(
-    base: Fit, screen: Screen, index: Sequence[int], train: Sequence[Experiment],
+    fitter: Fitter, base: Fit, screen: Screen, index: Sequence[int], train: Sequence[Experiment],
     seed: np.random.SeedSequence,
 ) -> dict[int, Candidate]:  # fmt: skip
-    """The candidates at `index`; waves among them with their period and phase by all rows that the
-    refits see, where a frequency that was near enough in the screen would lose its step."""
+    """The candidates at `index`; delays of inputs among them with the best length beside `base`,
+    which is of `fitter`; waves with their period and phase by all rows that the refits see, where
+    a frequency that was near enough in the screen would lose its step."""
     design = screen.design
     out = {k: design.candidates[k] for k in index}
+    for k, c in out.items():
+        if is_input_delay(c):
+            out[k] = best_delay(fitter, base.theta, c, train).candidate
     waves = [k for k, c in out.items() if c.effect.profile == "wave" and "period" in dict(c.shape)]
     if not waves:
         return out
