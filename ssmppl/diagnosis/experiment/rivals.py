@@ -28,6 +28,7 @@ from ssmppl.diagnosis.effects.candidate import Candidate, is_dated
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.densities import densities_of, density_of
 from ssmppl.diagnosis.fitting.fit import Fitter
+from ssmppl.diagnosis.fitting.scoring import increments_with_predictions
 from ssmppl.diagnosis.run.checkpoint import Numbers
 from ssmppl.diagnosis.selection.equivalence import SEPARATING
 from ssmppl.diagnosis.selection.refit import Refit
@@ -37,7 +38,7 @@ from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.newton import climb
-from ssmppl.inference.optimisation.parts import Predictions
+from ssmppl.inference.optimisation.parts import Increments, Predictions
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
 
@@ -178,7 +179,7 @@ class _Model:
             return likelihood(space.parameters(z)[0].copy())
 
         try:
-            rows = partial(increments, self.fitter, data)
+            rows = self._increments(data, len(start))
             found = climb_together(densities_of(space, rows), start[None], precise=False)
             if found is None:
                 return np.nan, self.z
@@ -192,6 +193,17 @@ class _Model:
         astray = ~space.on_the_line & (np.abs(z - self.z) > FAR)
         after = np.where(astray, self.z, z)
         return (value if np.isfinite(value) else np.nan) - 0.5 * len(z), after
+
+    def _increments(self, data: Sequence[Experiment], free: int) -> Increments:
+        """Those of a climb of so many free numbers, with predictions where there are any."""
+        gaussian = self.fitter.problem.program.gaussian
+        if isinstance(gaussian, GaussianApproximation) and not self.fitter.exact:
+            trace = self.fitter.problem.trace
+            if not isinstance(extended_model(trace), Extended):
+                found = increments_with_predictions(trace, gaussian, data, free)
+                if found is not None:
+                    return found
+        return partial(increments, self.fitter, data)
 
     def _log_likelihood(self, data: Sequence[Experiment], theta: np.ndarray) -> float:
         found = float(increments(self.fitter, data, theta[None])[0].sum())

@@ -27,6 +27,7 @@ from ssmppl.diagnosis.fitting.densities import (
     one_by_one,
 )
 from ssmppl.diagnosis.fitting.noisy_ascent import NEAR, stochastic_quasi_newton
+from ssmppl.diagnosis.fitting.scoring import climb_by_scoring
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
@@ -64,6 +65,7 @@ from ssmppl.language.model.transforms import transforms
 # Climbs.
 NOISE_SHARES = (1.0, 0.3, 0.1)  # of the transition's noise, from which climbs start
 ASTRAY = 3.0  # nats that the climb of the approximation may cost by the particle filter
+SCORED = 0.05  # nats that a climb by scoring may leave
 SPREAD = 0.1  # least information of a logarithm that steps are made with
 
 # Likelihoods and information by simulation.
@@ -282,7 +284,7 @@ class Fitter:
         if smooth is None:
             return self._fit_by_particles(space, seed, information)
         shares = NOISE_SHARES[: effort.levels]
-        space, top = self._top_of_extended_filter(space, smooth, seed, shares)
+        space, top = self._top_of_extended_filter(space, smooth, seed, shares, effort.approximate)
         if top is not None:
             information = positive_definite(top.information, ~space.on_the_line)
         fit = None
@@ -395,15 +397,16 @@ class Fitter:
 
     def _top_of_extended_filter(
         self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence,
-        shares: Sequence[float],
+        shares: Sequence[float], approximate: bool,
     ) -> tuple[Space, Top | None]:  # fmt: skip
         """The space at the top of that, from where it stands; as it is, and None, where the
-        particle filter knows better."""
+        particle filter knows better. approximate : to within a few hundredths of a nat."""
         function = density_of(space, smooth)
         tops = []
         for share in shares:
             begin = self._with_process_noise(space, share)
-            top = climb(function, begin.z[begin.positions])
+            z = begin.z[begin.positions]
+            top = self._scored(space, z) or climb(function, z)
             if top is not None:
                 tops.append(top)
 
@@ -415,8 +418,18 @@ class Fitter:
         for top in sorted(tops, key=lambda top: -top.value):
             there = at(space, space.parameters(top.z)[0].copy())
             if estimate(there) >= was - ASTRAY:
+                if not approximate and (higher := climb(function, top.z)) is not None:
+                    there, top = at(space, space.parameters(higher.z)[0].copy()), higher
                 return there, top
         return space, None
+
+    def _scored(self, space: Space, z: np.ndarray) -> Top | None:
+        """The top near z (F,) by Fisher's scoring, where that applies and comes to its end."""
+        gaussian = space.problem.program.gaussian
+        if not isinstance(gaussian, GaussianApproximation):
+            return None
+        top = climb_by_scoring(space, gaussian, z, self.log_correction)
+        return top if top is not None and top.distance < SCORED else None
 
     def _better_of(
         self, fit: Fit | None, space: Space, top: Top, seed: np.random.SeedSequence
@@ -478,7 +491,9 @@ class Fitter:
         function = density_of(space, smooth)
         top = None
         if not effort.pilot:
-            top = climb(function, space.z[space.positions])
+            top = self._scored(space, space.z[space.positions])
+            if top is None or effort.standard_errors:
+                top = climb(function, space.z[space.positions] if top is None else top.z)
         if top is not None and top.distance < (GOOD if effort.standard_errors else NEAR):
             theta, converged = space.parameters(top.z)[0].copy(), True
         elif len(space.positions):

@@ -7,24 +7,18 @@ so that a simulator in the transition is called once a row, whatever the number 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.proposals.twisted import (
-    LookaheadModel,
-    jacobian,
-    lookahead_model,
-    noise_form,
-)
-from ssmppl.analysis.vectorised import vectorised
+from ssmppl.analysis.proposals.twisted import LookaheadModel, jacobian, lookahead_model
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
-from ssmppl.expressions.calculus import NotDifferentiable, differentiate
-from ssmppl.expressions.expr import Expr, depends_on, symbols_of
+from ssmppl.expressions.expr import Expr, depends_on
+from ssmppl.inference.batched.observed import Part, Seen, gaussian_observation
 from ssmppl.inference.optimisation.parts import Predictions
 from ssmppl.language.model.trace import Trace
 
@@ -63,10 +57,10 @@ class BatchedFilter:
         place = np.zeros((n, n), dtype=int)  # of each entry of a curvature among these
         place[np.tril_indices(n)] = np.arange(len(half))
         self._half = np.maximum(place, place.T).ravel()
-        self._begin = _Part(trace, [*first.at_rest(), *first.spread()[own].ravel()])
-        self._move = _Part(trace, [*later.at_rest(), *slope.ravel(), *later.spread()[own].ravel()])
-        self._look = _Part(trace, [found.observed, *found.slope[own], *half])
-        self._predict = _gaussian_observation(trace, own)
+        self._begin = Part(trace, [*first.at_rest(), *first.spread()[own].ravel()])
+        self._move = Part(trace, [*later.at_rest(), *slope.ravel(), *later.spread()[own].ravel()])
+        self._look = Part(trace, [found.observed, *found.slope[own], *half])
+        self._predict = gaussian_observation(trace, own)
         self._everywhere = n == d
 
     def log_likelihoods(
@@ -95,7 +89,7 @@ class BatchedFilter:
     ) -> tuple[np.ndarray, Predictions | None]:
         """The increments, and the predictions of each row by what is linear there; None of
         observations that are not Gaussian."""
-        lanes, seen = _Lanes(self.trace, experiments, np.asarray(theta)), list[_Seen]()
+        lanes, seen = _Lanes(self.trace, experiments, np.asarray(theta)), list[Seen]()
         rows = self._followed(lanes, None, seen)
         if not seen or len(seen) < lanes.steps:
             return rows, None
@@ -103,7 +97,7 @@ class BatchedFilter:
         return rows, Predictions(lanes.of_vectors(error), lanes.of_vectors(covariance))
 
     def _followed(
-        self, lanes: _Lanes, record: list[Moments] | None, seen: list[_Seen] | None
+        self, lanes: _Lanes, record: list[Moments] | None, seen: list[Seen] | None
     ) -> np.ndarray:
         """(B, R) increments; `seen` takes the predictions of each row."""
         out = np.zeros((lanes.count, lanes.steps))
@@ -247,86 +241,6 @@ def _uncertain(found: LookaheadModel, trace: Trace) -> np.ndarray:
         if not more:
             return np.array(sorted(uncertain), dtype=int)
         uncertain |= more
-
-
-class _Part:
-    """Expressions of one distribution, evaluated for all lanes."""
-
-    def __init__(self, trace: Trace, expressions: Sequence[Expr]):
-        self.size = len(expressions)
-        self.fixed = np.zeros(self.size)
-        self.at: list[int] = []
-        moving = []
-        for k, e in enumerate(expressions):
-            if e.op == "const":
-                self.fixed[k] = e.data
-            else:
-                self.at.append(k)
-                moving.append(e)
-        known = {s for e in moving for s in symbols_of([e])}
-        self.symbols = sorted(known, key=lambda s: repr(s.data))
-        self.run: Callable[[Sequence[Any]], list[Any]] = vectorised(moving, self.symbols)
-        states = {s.data[1:]: k for k, s in enumerate(trace.state_symbols)}
-        self.sources = [(s.data[0], states.get(s.data[1:], s)) for s in self.symbols]
-
-    def __call__(
-        self, lanes: _Lanes, x: np.ndarray | None, x_prev: np.ndarray | None
-    ) -> np.ndarray:
-        """(L, expressions)."""
-        given: list[Any] = []
-        for (kind, place), symbol in zip(self.sources, self.symbols, strict=True):
-            if kind == "state":
-                assert x is not None
-                given.append(x[:, place])
-            elif kind == "state_prev":
-                assert x_prev is not None
-                given.append(x_prev[:, place])
-            else:
-                given.append(lanes.value(symbol))
-        out = np.empty((lanes.count, self.size))
-        out[:] = self.fixed
-        for k, value in zip(self.at, self.run(given), strict=True):
-            out[:, k] = value
-        return out
-
-
-_Seen = tuple[np.ndarray, np.ndarray]  # of one row, in each lane: as of `Predictions`
-
-
-class _GaussianObservation:
-    """What is observed, as mean (K,) and noise about it, and by the filter's states (K, N)."""
-
-    def __init__(self, trace: Trace, mean: Sequence[Expr], slope: np.ndarray, spread: np.ndarray):
-        self.shape = slope.shape
-        self._part = _Part(trace, [*mean, *slope.ravel(), *spread.ravel()])
-
-    def __call__(self, lanes: _Lanes, rest: np.ndarray, p: np.ndarray) -> _Seen:
-        """The predictions of a row from the mean (L, D) and covariance (L, N, N) of its states."""
-        k, n = self.shape
-        values = self._part(lanes, rest, None)
-        mean, slope = values[:, :k], values[:, k : k + k * n].reshape(-1, k, n)
-        spread = values[:, k + k * n :].reshape(len(values), k, -1)
-        covariance = slope @ p @ slope.transpose(0, 2, 1) + spread @ spread.transpose(0, 2, 1)
-        y, seen = lanes.measured()
-        both = seen[:, :, None] & seen[:, None, :]
-        return np.where(seen, y - mean, 0.0), np.where(both, covariance, np.eye(k))
-
-
-def _gaussian_observation(trace: Trace, own: np.ndarray) -> _GaussianObservation | None:
-    """By the states at `own` (N,); None of observations that are not all driven by Gaussian noise,
-    or not by states alone."""
-    form = noise_form(list(trace.observations.values()), list(trace.observation_symbols))
-    if isinstance(form, NotApplicable):
-        return None
-    mean, spread = form.at_rest(), form.spread()
-    if any(depends_on(e, trace.observation_symbols) for e in [*mean, *spread.ravel()]):
-        return None  # a channel by another one of its row
-    states = [trace.state_symbols[k] for k in own]
-    try:
-        slope = np.array([differentiate(list(mean), s) for s in states]).T
-    except NotDifferentiable:
-        return None
-    return _GaussianObservation(trace, list(mean), slope, spread)
 
 
 class _Lanes:
