@@ -107,6 +107,9 @@ def climb_together(function: Function, starts: np.ndarray, precise: bool = True)
     ]
     if not climbers:
         return None
+    if not starts.shape[1]:  # nothing is free
+        climbers[0].distance, climbers[0].ended = 0.0, True
+        return climbers[0]
     _differentiate(function, dict.fromkeys(climbers))
     further = LATE
     for step in range(STEPS):

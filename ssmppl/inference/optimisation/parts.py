@@ -117,8 +117,10 @@ def _whitened_slopes(p: Predictions, h: np.ndarray) -> np.ndarray | None:
         return None
     mean = np.einsum("rij,frj->fri", root, _slopes(p.error, h))
     spread = root @ _slopes(p.covariance, h) @ root.transpose(0, 2, 1) / np.sqrt(2.0)
-    n = len(h)
-    out = np.concatenate([mean.reshape(n, -1), spread.reshape(n, -1)], axis=1)
+    n, rows, channels = mean.shape
+    out = np.concatenate(
+        [mean.reshape(n, rows * channels), spread.reshape(n, rows * channels**2)], axis=1
+    )
     return out if np.all(np.isfinite(out)) else None
 
 

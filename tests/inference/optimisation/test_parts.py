@@ -96,6 +96,15 @@ def test_outer_products_stand_in_where_a_covariance_has_no_root():
     np.testing.assert_array_equal(found.information(h, nothing), expected)
 
 
+def test_where_nothing_is_free_there_is_no_information():
+    nothing = np.empty(0)
+    assert likelihood(TOP[None]).information(nothing, nothing).shape == (0, 0)
+    found = climb_together(lambda z: likelihood(TOP[None]), np.empty((1, 0)))
+    assert found.ended
+    assert found.top.distance == 0.0
+    assert found.top.information.shape == (0, 0)
+
+
 def test_points_without_a_prior_density_have_no_value_and_leave_the_others_alone():
     z = np.array([TOP, TOP + 1.0, TOP + 2.0])
 
