@@ -151,7 +151,7 @@ def _report_values(report: GapReport) -> dict[str, Any]:
     return {
         "verdict": report.verdict, "chosen": report.chosen, "estimates": report.estimates,
         **tables, "missing": tables.get("missing"), "signals": tables.get("signals"),
-        "formula": tables.get("formula"),
+        "formula": tables.get("formula"), "probabilities": tables.get("probabilities"),
         "experiment": None if report.experiment is None else records(report.experiment),
         "separation": _separation(report), "complete": not len(report.left_out),
         "parts": report.parts, "notes": report.notes,

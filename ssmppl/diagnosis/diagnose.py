@@ -20,6 +20,7 @@ from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
 from ssmppl.diagnosis.experiment.design import MOST_ROWS, separate
+from ssmppl.diagnosis.experiment.recovery import recovery
 from ssmppl.diagnosis.experiment.rivals import Rival, has_filter
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, proposal_of
 from ssmppl.diagnosis.fitting.bounds import bounds_note
@@ -261,6 +262,12 @@ class _Diagnosis:
             return
         with self.failures.guard("whether several effects predict better than fewer"):
             self._validate_on_held_out_rows(r)
+        if found.chosen is not None:
+            with self.failures.guard("who is taken for whom"):
+                r.recovery = recovery(
+                    self.augmented, [x for x in r.refits if len(x.index) == 1],
+                    r.screen.experiments, self._seed(Stage.RECOVERY), self.checkpoint,
+                )  # fmt: skip
         with self.failures.guard("the experiment that would separate the class best"):
             self._separating_experiment(r)
         with self.failures.guard("how far the gap closes"):

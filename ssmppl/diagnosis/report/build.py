@@ -84,7 +84,10 @@ def build_report(r: Results, seconds: float) -> GapReport:
         if len(causes) and (text or r.unfitted is not None):
             leading = table("leading", lambda: _leading(r, order), leading)
         attributes = table("attributes", lambda: _attributes(r, order, causes, leading), {})
-    signals = experiment = None
+    signals = experiment = taken = None
+    if (recovered := r.recovery) is not None:
+        with r.failures.guard("the table 'probabilities'"):
+            taken = tables.probabilities_table(screen, recovered)
     if (found_apart := r.separation) is not None:
         with r.failures.guard("the experiment"):
             signals = tables.signals_table(found_apart)
@@ -101,7 +104,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
         verdict=decision.verdict, where=where, causes=causes, classes=classes, closed=share,
         detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
         free_run=free, not_applicable=_not_applicable(screen), missing=missing,
-        formula=formula,
+        formula=formula, probabilities=taken,
         signals=signals, experiment=experiment, separation=r.separation,
         model=augmented, model_text=text, chosen=r.names if text else [], estimates=estimates,
         leading=leading, attributes=attributes, parts=_parts(r),

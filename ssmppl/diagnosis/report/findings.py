@@ -28,6 +28,9 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "sign", "estimate", "se",
     ),
     "classes": ("class_id", "effect", "equation", "rho", "separating_input"),
+    "probabilities": (
+        "effect", "equation", "named", "named_equation", "probability", "behind", "cut",
+    ),
     "signals": ("signal", "input", "nats", "note"),
     "closed": (
         "effect", "horizon", "rmse_before", "rmse_after", "share", "low", "high",
@@ -83,6 +86,7 @@ class Findings:
     not_applicable: pd.DataFrame
     missing: pd.DataFrame | None = None
     formula: pd.DataFrame | None = None
+    probabilities: pd.DataFrame | None = None
     signals: pd.DataFrame | None = None
     experiment: pd.DataFrame | None = None
     separation: Separation | None = None
@@ -121,8 +125,8 @@ class Findings:
         Returns
         -------
         dict of DataFrames
-            `where`, `causes`, `classes`, `closed` and the others above, and `left_out`; `missing`
-            `formula` and `signals` only if there is one.
+            `where`, `causes`, `classes`, `closed` and the others above, and `left_out`; `missing`,
+            `formula`, `probabilities` and `signals` only if there is one.
         """
         names = [f.name for f in fields(self) if f.name in COLUMNS]
         found = {name: getattr(self, name) for name in [*names, "left_out"]}

@@ -36,13 +36,16 @@ HEADINGS = {
     "nats_per_sample": "nats per sample", "gain_mean": "nats, conditional mean",
     "gain_noise": "nats, rest of the distribution", "rmse_before": "error before",
     "rmse_after": "error after", "p": "p", "horizon": "rows ahead", "share": "error reduced by",
-    "low": "from", "high": "to",
+    "low": "from", "high": "to", "named": "came first", "named_equation": "in",
+    "probability": "of the sets", "behind": "nats behind, in the data",
+    "cut": "nats behind, in 95% of its sets",
 }  # fmt: skip
 MODELS = {"before": "original model", "after": "augmented model",
           "simulation": "the same, for simulation"}  # fmt: skip
 TABLES = {
     "causes": "All effects tried, best first",
     "classes": "Effects not distinguishable by these data",
+    "probabilities": "Who is taken for whom, in data simulated with each",
     "signals": "Signals that were tried to distinguish them, best first",
     "where": "Where the gap is",
     "closed": "Held-out gain",

@@ -12,6 +12,7 @@ from ssmppl.data.channels import column_names
 from ssmppl.data.time_steps import lengths
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, starts_of
 from ssmppl.diagnosis.experiment.design import Separation
+from ssmppl.diagnosis.experiment.recovery import Recovery
 from ssmppl.diagnosis.heldout.predictions import FreeRun
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.screening.location import BasisGroupScore, curve, localise, regions, when
@@ -245,6 +246,18 @@ def classes_table(
                 "separating_input": best.signal.words if best and number == FIRST else "",
             })  # fmt: skip
     return tabulate("classes", rows)
+
+
+def probabilities_table(screen: Screen, found: Recovery) -> pd.DataFrame:
+    """Each pair of leading effects: how often the second is the best in data of the first."""
+    offered = [screen.design.candidates[k] for k in found.columns]
+    named, behind, cuts = found.named, found.behind, found.cuts
+    return tabulate("probabilities", [
+        {"effect": c.effect.name, "equation": c.place, "named": d.effect.name,
+         "named_equation": d.place, "probability": float(named[i, j]),
+         "behind": float(behind[i]), "cut": float(cuts[i])}
+        for i, c in enumerate(offered) for j, d in enumerate(offered)
+    ])  # fmt: skip
 
 
 def signals_table(separation: Separation) -> pd.DataFrame | None:

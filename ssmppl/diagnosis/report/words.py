@@ -498,6 +498,7 @@ def how_sure(report: Findings) -> list[str]:
             once = len(used) > 1 and "choice" not in report.parts
             out.append(text + " Selection and evaluation rows are disjoint." * once)
     out += [sentence(str(v)) for v in report.parts.values() if isinstance(v, str)]
+    out += [sentence(text) for text in [_recognised(report)] if text]
     tests = [r for r in rows(report.detection) if is_number(r["p"])]
     bad = significant_rows(report, report.detection)
     if bad:
@@ -511,6 +512,26 @@ def how_sure(report: Findings) -> list[str]:
         out.append("This does not validate the model: an effect that is not excited cannot be "
                    "identified from these data.")  # fmt: skip
     return out
+
+
+def _recognised(report: Findings) -> str:
+    """How often the first effect comes first where it is the truth, and which one else."""
+    if report.verdict != EFFECT or not (found := leaders(report)):
+        return ""
+    own = found[0]["effect"], found[0]["equation"]
+    mine = [r for r in rows(report.probabilities) if (r["effect"], r["equation"]) == own]
+    right = [r for r in mine if (r["named"], r["named_equation"]) == own]
+    if not right:
+        return ""
+    text = (
+        f"in data simulated with {label(*own)} on the same inputs, and fitted alike, it came first "
+        f"of {len(mine)} in {percent(right[0]['probability'])} of the sets"
+    )
+    others = sorted((r for r in mine if r not in right), key=lambda r: -r["probability"])
+    if others and others[0]["probability"] > 0.0:
+        other = label(others[0]["named"], others[0]["named_equation"])
+        text += f", {other} in {percent(others[0]['probability'])}"
+    return text
 
 
 def to_decide(report: Findings) -> list[str]:

@@ -20,6 +20,7 @@ class Stage(IntEnum):
     HELD_OUT = 8
     STATES = 11  # at the fit, for the scales
     TIMING = 12
+    RECOVERY = 13  # of the leading effects from data simulated with each
 
 
 class Choice(IntEnum):

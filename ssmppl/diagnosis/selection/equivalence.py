@@ -1,10 +1,11 @@
 """Equivalence classes of candidates that these data do not separate.
 
 The class of the best is its confidence set: the refits that lie no further behind than the truth
-would by chance; those of its kind that lose no more to it than a formula that is only about right
-would lose to the machine's own law, whose effect may have the better formula next time; and
-candidates whose scores correlate so much with the best one's that its gain
-does not separate them.
+would by chance, here by the scores' normal distribution and in data simulated with each of them
+(`experiment/recovery.py`); those of its kind that lose no more to it than a formula that is only
+about right would lose to the machine's own law, whose effect may have the better formula next time;
+and candidates whose scores correlate so much with the best one's that its gain does not separate
+them.
 
 Near the base model the log-likelihood gains are quadratic: under truth k of strength lambda the
 efficient scores are S~ ~ N(lambda V[:, k], V), so that z ~ N(delta rho[:, k], rho) with delta^2 / 2
@@ -15,7 +16,7 @@ g = 1.645^2 / (1 - |rho|) = 2.7 / (1 - |rho|).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,11 +156,14 @@ def group_leaders(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     ]
 
 
-def equivalence_classes(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:
+def equivalence_classes(
+    screen: Screen, refits: Sequence[Refit], order: Sequence[int], alike: Container[int] = ()
+) -> Classes:
     """Classes of the candidates in `order` (of `group_leaders`); each weak one is its own.
 
-    What gained more than the first one and was passed over for it only describes a misfit
-    (`preferred`): it is no rival, and not in its class.
+    alike : columns that fits to simulated data do not tell from the first. What gained more than
+    the first one and was passed over for it only describes a misfit (`preferred`): it is no rival,
+    and not in its class.
     """
     refitted = {r.index[0]: max(r.score, 0.0) for r in refits if len(r.index) == 1}
     at = np.array(order, dtype=int)
@@ -172,6 +176,7 @@ def equivalence_classes(screen: Screen, refits: Sequence[Refit], order: Sequence
     class_id, leader = np.zeros(len(at), int), np.arange(len(at))
     if refitted:
         first = _of_the_best(rho, gains, sided, len(refitted), strong, kind)
+        first |= np.array([k in alike for k in order], dtype=bool)
         class_id[first], leader[first] = 1, 0
     rest = np.flatnonzero(strong & (class_id == 0))
     if len(rest):

@@ -9,6 +9,7 @@ from typing import Any
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.experiment.design import Separation
+from ssmppl.diagnosis.experiment.recovery import Recovery
 from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain
 from ssmppl.diagnosis.heldout.row_split import RowSplit
@@ -25,8 +26,9 @@ from ssmppl.language.model.trace import Trace
 class Results:
     """The results of the stages so far. selection, held_out : None where not done.
 
-    blocks : left out in turn, 0 for three parts. separation : of the first class, None where it was
-    not looked for.
+    blocks : left out in turn, 0 for three parts. recovery : of the leading effects in data that are
+    simulated with each; None where there is none. separation : of the first class, None where it
+    was not looked for.
     """
 
     trace: Trace
@@ -42,6 +44,7 @@ class Results:
     selection: SelectionResult | None = None
     held_out: HeldOutGain | None = None
     blocks: int = 0
+    recovery: Recovery | None = None
     separation: Separation | None = None
     interrupted: bool = False
     failures: Failures = field(default_factory=Failures)
@@ -89,7 +92,8 @@ class Results:
     def classes(self) -> tuple[list[int], Classes]:
         """The leading shapes of all groups, best first, and their classes."""
         order = group_leaders(self.screen, self.refits)
-        return order, equivalence_classes(self.screen, self.refits, order)
+        alike = self.recovery.inside if self.recovery else set()
+        return order, equivalence_classes(self.screen, self.refits, order, alike)
 
 
 def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> list[str]:

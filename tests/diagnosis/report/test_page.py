@@ -229,7 +229,11 @@ def test_an_empty_report_has_a_page(verdict):
         plots.page(
             GapReport(
                 verdict,
-                **{name: tabulate(name) for name in COLUMNS if name not in ("left_out", "signals")},
+                **{
+                    name: tabulate(name)
+                    for name in COLUMNS
+                    if name not in ("left_out", "signals", "probabilities")
+                },
             )
         )
     )

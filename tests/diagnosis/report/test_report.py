@@ -44,7 +44,7 @@ from tests.diagnosis.made_up import (
     with_experiment,
 )
 
-OPTIONAL = ("missing", "formula", "signals", "left_out")  # tables
+OPTIONAL = ("missing", "formula", "probabilities", "signals", "left_out")  # tables
 
 
 def empty(verdict="no measurable gap", **fields):
