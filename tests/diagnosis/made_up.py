@@ -291,10 +291,24 @@ def with_experiment(found=None):
     )
 
 
+def recovered():
+    """Of the two leading effects the first is taken for the second in three sets of ten."""
+    rivals = [("quadratic drag", "v", 0.0, 1.2), ("state-dependent damping", "v", 1.5, 0.8)]
+    shares = [[0.7, 0.3], [0.1, 0.9]]
+    return dataclasses.replace(effect_found(), probabilities=tabulate("probabilities", [
+        dict(effect=e, equation=q, behind=b, cut=c, named=rivals[j][0], named_equation=rivals[j][1],
+             probability=shares[i][j])
+        for i, (e, q, b, c) in enumerate(rivals) for j in range(2)
+    ]))  # fmt: skip
+
+
 ALL = {
     f.__name__: f
-    for f in (effect_found, none_of_these, no_gap, fast, several, break_of_level, with_experiment)
-}
+    for f in (
+        effect_found, none_of_these, no_gap, fast, several, break_of_level, with_experiment,
+        recovered,
+    )
+}  # fmt: skip
 
 
 def oscillation(steps):

@@ -18,6 +18,7 @@ from ssmppl.diagnosis.report.words import (
     class_letters,
     headline,
     how_far,
+    how_sure,
     label,
     leaders,
     listed,
@@ -39,6 +40,7 @@ from tests.diagnosis.made_up import (
     fast,
     no_gap,
     none_of_these,
+    recovered,
     separation,
     several,
     with_experiment,
@@ -423,3 +425,19 @@ def test_a_formula_is_told_as_a_suggestion():
     assert "86% of the gain of the curves" in text
     assert "formula" not in " ".join(which(none_of_these()))
     assert list(found.tables()["formula"]["term"]) == ["x**2", "x*u"]
+
+
+# -- who is taken for whom
+def test_how_often_the_first_effect_is_recognised_is_told():
+    text = " ".join(how_sure(recovered()))
+    assert (
+        "In data simulated with quadratic drag in v on the same inputs, and fitted alike, it came "
+        "first of 2 in 70% of the sets, state-dependent damping in v in 30%." in text
+    )
+    report = recovered()
+    sure = report.probabilities.assign(probability=[1.0, 0.0, 0.0, 1.0])
+    text = " ".join(how_sure(dataclasses.replace(report, probabilities=sure)))
+    assert "it came first of 2 in 100% of the sets." in text
+    assert "came first" not in " ".join(how_sure(effect_found()))
+    none = dataclasses.replace(report, verdict="none of these")
+    assert "came first" not in " ".join(how_sure(none))

@@ -17,6 +17,7 @@ from ssmppl.diagnosis.effects.catalogue_motion import (
 )
 from ssmppl.diagnosis.effects.catalogue_sensor import sensor_rectification
 from ssmppl.diagnosis.experiment.design import ALIKE, BEHIND, OUTSIDE
+from ssmppl.diagnosis.experiment.recovery import Recovery
 from ssmppl.diagnosis.report.tables import (
     _experiments,
     _when,
@@ -25,6 +26,7 @@ from ssmppl.diagnosis.report.tables import (
     classes_table,
     estimated_strength,
     experiment_table,
+    probabilities_table,
     signals_table,
     where_table,
 )
@@ -227,6 +229,23 @@ def test_the_length_of_a_step_is_left_to_the_labels_where_it_follows_from_them(o
     assert list(table.columns) == ["time", "u", *["dt"] * own]
     u, *_ = bind_inputs(traced, table, None)
     np.testing.assert_array_equal(u, found[0].u)
+
+
+def test_probabilities_are_of_each_pair():
+    sets = np.zeros((2, 4, 2))
+    sets[0, :, 1] = [-1.0, -2.0, 0.5, -3.0]
+    sets[1, :, 0] = -1.0
+    found = Recovery((5, 2), np.array([10.0, 8.5]), sets)
+    offered = [SimpleNamespace(effect=SimpleNamespace(name=f"e{k}"), place=f"q{k}")
+               for k in range(6)]  # fmt: skip
+    table = probabilities_table(SimpleNamespace(design=SimpleNamespace(candidates=offered)), found)
+    assert table[["effect", "equation", "named", "named_equation"]].values.tolist() == [
+        ["e5", "q5", "e5", "q5"], ["e5", "q5", "e2", "q2"],
+        ["e2", "q2", "e5", "q5"], ["e2", "q2", "e2", "q2"],
+    ]  # fmt: skip
+    np.testing.assert_allclose(table["probability"], [0.75, 0.25, 0.0, 1.0])
+    np.testing.assert_allclose(table["behind"], [0.0, 0.0, 1.5, 1.5])
+    np.testing.assert_allclose(table["cut"], [0.5, 0.5, 0.0, 0.0])
 
 
 def test_signals_stand_behind_the_recorded_inputs():
