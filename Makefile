@@ -5,7 +5,7 @@
 #   make test       format, lint, types, tests
 #   make slow       the long statistical checks
 #   make exhaustive the same with whole tables and very long chains: hours
-#   make gap        the blind benchmark of the diagnosis: of 24 sets what four minutes allow
+#   make gap        the blind benchmark of the diagnosis: of 24 sets what three minutes allow
 #   make tables     the tables of unbiasedness at full length, over an hour
 #   make examples   run what is under examples/
 #   make check      the examples against statsmodels, hmmlearn and particles
@@ -82,7 +82,7 @@ tables: $(VENV)/.installed-dev
 
 gap: $(VENV)/.installed-dev
 	$(BIN)/python -m bench.gap.generate --subset ci
-	$(BIN)/python -m bench.gap.run --subset ci --mode fast --workers $(WORKERS) --minutes 4
+	$(BIN)/python -m bench.gap.run --subset ci --mode fast --workers $(WORKERS) --minutes 3
 	$(BIN)/python -m bench.gap.score --subset ci --methods diagnose-fast \
 	    --require failed "false alarm"
 
