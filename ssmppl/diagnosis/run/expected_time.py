@@ -10,12 +10,13 @@ from dataclasses import dataclass
 
 from ssmppl.inference.run.executors import workers_of
 
-REFITS = 18  # of single effects, their shapes, pairs and the reference, about
-EVALUATIONS, FIT_PASSES = 4000, 60  # likelihoods and passes over the data in a fit, about
-TOGETHER = 250  # likelihoods in a fit where many are looked at in one call
-APPROXIMATE = 800  # likelihoods in an approximate fit
+REFITS = 24  # of single effects, overlooked ones, shapes, pairs and the reference, about
+EVALUATIONS, FIT_PASSES = 1500, 60  # likelihoods and passes over the data in a fit, about
+TOGETHER = 150  # likelihoods in a fit where many are looked at in one call
+APPROXIMATE = 300  # likelihoods in an approximate fit
+RECOVERY = 10_000  # likelihoods in fits of the leading effects to data simulated with each
 SCREENS = 1.0  # as long as the first one that follow it: for further effects, under other inputs
-TEXT = 0.5  # of the time that the screen's code took, which a fit's takes, one at a time
+TEXT = 0.3  # of the time that the screen's code took, which a fit's takes, one at a time
 BESIDE = 1.5  # times as long as what is timed here alone: Python between the passes, and waiting
 SIMULATED = 3 * 50  # approximate fits of simulated data in short records, about
 FOLD_FITS, FOLD_PASSES = 8, 12  # approximate fits, and passes, for a block that is left out
@@ -60,6 +61,7 @@ def seconds(
     one = evaluations * found.likelihood + FIT_PASSES * found.fit_pass * (not simulator)
     approximate, text = APPROXIMATE * found.likelihood, TEXT * found.generating
     total = screen * (1.0 + SCREENS) + REFITS * (one / workers + text)
+    total += RECOVERY * found.likelihood / workers * (not simulator)
     if folds:
         if not simulator:
             total += SIMULATED * (approximate + found.screen_pass) / workers
