@@ -45,7 +45,7 @@ MODELS = {"before": "original model", "after": "augmented model",
 TABLES = {
     "causes": "All effects tried, best first",
     "classes": "Effects not distinguishable by these data",
-    "probabilities": "Who is taken for whom, in data simulated with each",
+    "probabilities": "Which effect came first, in data simulated with each",
     "signals": "Signals that were tried to distinguish them, best first",
     "where": "Where the gap is",
     "closed": "Held-out gain",
