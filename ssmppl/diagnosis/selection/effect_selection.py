@@ -26,9 +26,15 @@ from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.input_delays import promising_delays
-from ssmppl.diagnosis.selection.overlooked import best_start, most_promising, overlooked
+from ssmppl.diagnosis.selection.overlooked import (
+    best_start,
+    elsewhere,
+    most_promising,
+    overlooked,
+)
 from ssmppl.diagnosis.selection.refit import (
     EXPLAINED,
+    Begin,
     Refit,
     best_of_groups,
     correlated_candidates,
@@ -192,10 +198,12 @@ class EffectSelection:
         for (k, *_), numbers in zip(shapes, starts, strict=True):
             name = f"the likelihood with {self.screen.design.candidates[k]}"
             self.checkpoint.failures.record_task(name, numbers)
-        found = most_promising(starts, self.augmented.trace)
+        groups = {int(self.screen.groups[r.index[0]]): r.gain for r in refits}
+        done = {k: groups[int(g)] for k, g in enumerate(self.screen.groups) if int(g) in groups}
+        found = most_promising(starts, self.augmented.trace, done)
         more, failed = self._refit(
             out, out.base, self.screen, [[int(n["column"])] for n in found], seed, stage,
-            strengths=[float(n["strength"]) for n in found],
+            begins=[Begin(float(n["strength"]), elsewhere(n)) for n in found],
         )  # fmt: skip
         out.notes += [f"not refitted: {reason}" for reason in failed]
         return more
@@ -209,12 +217,12 @@ class EffectSelection:
         self, out: SelectionResult, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
         seed: np.random.SeedSequence, stage: str, given: Sequence[Candidate] = (), *,
         checkpoint: Checkpoint | None = None, afresh: bool = False,
-        strengths: Sequence[float] | None = None,
+        begins: Sequence[Begin] | None = None,
     ) -> tuple[list[Refit], list[str]]:  # fmt: skip
         return refit_all(
             self.augmented, base, screen, sets, self.train, seed, checkpoint or self.checkpoint,
             stage, given, afresh=afresh, approximate=self.approximate, simulation=out.simulation,
-            strengths=strengths,
+            begins=begins,
         )  # fmt: skip
 
     def _shaped(

@@ -4,13 +4,15 @@ A score looks at a strength of zero, with the parameters as they are. Where the 
 a parameter has taken on part of the effect, that tells little: a drag that the linear damping
 stands in for, or a stop, beyond which the simulated sets go and the data never do. So where what
 only describes a misfit gains most, the mechanisms of the same equation are fitted too, each from
-the best of a few strengths and shapes.
+the best of a few strengths and shapes: those of the screen, and others all over the range of each,
+as a stop that is touched twice lies further out than the screen looks.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from ssmppl.diagnosis.run.checkpoint import Numbers
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.screening.statistics import typical_squares
 from ssmppl.diagnosis.selection.refit import Refit, only_by_particles, preferred
+from ssmppl.diagnosis.selection.shapes import shape_bounds
 from ssmppl.errors import SSMError
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.preparation.space import space_of
@@ -33,12 +36,15 @@ MOST = 20  # mechanisms whose likelihood is looked at
 FITTED, FITTED_CALLED = 8, 5  # of these that are fitted; of a model that calls a simulator
 AGAINST = 2.0  # standard deviations by which a score may have the sign that is not allowed
 GRID = (1.0, 4.0, 16.0, 64.0)  # strengths, in standard errors by the data's own information
+ELSEWHERE = 7  # values of a shape between its bounds
+PRICE = 1.0  # nats that a shape elsewhere has to gain
 HOPELESS = 20.0  # nats below the model as it is, beyond which larger strengths are not tried
 
 
 def overlooked(screen: Screen, refits: Sequence[Refit], worth: float) -> list[list[int]]:
-    """The shapes of each mechanism, by their columns, that was not refitted and acts in the
-    equation of the refit that would be named, where that is none; the highest in the screen first.
+    """The shapes of each mechanism, by their columns, that acts in the equation of the refit that
+    would be named, where that is none; the highest in the screen first. Of those that were refitted
+    the ones that have shapes to estimate.
 
     worth : nats that the best one has to gain.
     """
@@ -49,8 +55,8 @@ def overlooked(screen: Screen, refits: Sequence[Refit], worth: float) -> list[li
         return []
     places, out = _equations(c, screen.design.trace), []
     for head in screen.family.leaders:
-        group = int(screen.groups[head])
-        if group in done or not _acts(screen.design.candidates[head], places):
+        group, c = int(screen.groups[head]), screen.design.candidates[head]
+        if not _acts(c, places) or (group in done and not shape_bounds(c, screen.design.scales)):
             continue
         shapes = [k for k in np.flatnonzero(screen.groups == group).tolist() if _allowed(screen, k)]
         if shapes:
@@ -84,12 +90,13 @@ def best_start(
     augmented: AugmentedModels, base: Fit, screen: Screen, shapes: Sequence[Sequence[int]],
     train: Sequence[Experiment], i: int,
 ) -> Numbers:  # fmt: skip
-    """The column and the strength with which the mechanism i fits best, the parameters as they are,
-    and its gain; none where no strength fits better than the model as it is."""
+    """The column, the strength and the shape elsewhere, if any, with which the mechanism i fits
+    best, the parameters as they are, and its gain; none where no strength fits better than the
+    model as it is."""
     level = augmented.base_fitter.value(train, base.theta)
-    best, out = level, dict[str, float]()
-    for k in shapes[i]:
-        c = screen.design.candidates[k]
+    best, out = level, dict[str, Any]()
+    for k, elsewhere in _every_shape(screen, shapes[i]):
+        c = screen.design.candidates[k].with_shape(**elsewhere)
         try:
             fitter = augmented.fitter((c,))
             if only_by_particles(augmented, fitter):
@@ -101,9 +108,10 @@ def best_start(
                     with warnings.catch_warnings():  # of a simulator that is pushed too hard
                         warnings.simplefilter("ignore")
                         value = fitter.value(train, theta)
-                    if value > best:
-                        best = value
-                        out = {"column": k, "strength": strength, "gain": value - level}
+                    if value - PRICE * bool(elsewhere) > best:
+                        best = value - PRICE * bool(elsewhere)
+                        out = {"column": k, "strength": strength, "gain": best - level}
+                        out |= {f"shape {n}": v for n, v in elsewhere.items()}
                     if not value > level - HOPELESS:
                         break
         except SSMError:
@@ -111,9 +119,32 @@ def best_start(
     return {name: np.array(value) for name, value in out.items()}
 
 
-def most_promising(starts: Sequence[Numbers], trace: Trace) -> list[Numbers]:
-    """Of what `best_start` found, the best ones."""
-    found = sorted((n for n in starts if "gain" in n), key=lambda n: -float(n["gain"]))
+def _every_shape(screen: Screen, columns: Sequence[int]) -> Iterator[tuple[int, dict[str, float]]]:
+    """Each column as it is, and the first with each of its shapes elsewhere, one at a time."""
+    yield from ((k, {}) for k in columns)
+    bounds = shape_bounds(screen.design.candidates[columns[0]], screen.design.scales)
+    for name, (low, high) in bounds.items():
+        for value in np.linspace(low, high, ELSEWHERE + 2)[1:-1]:
+            yield columns[0], {name: float(value)}
+
+
+def elsewhere(numbers: Numbers) -> dict[str, float]:
+    """The shape that `best_start` found, where it is none of the screen's."""
+    return {
+        name.removeprefix("shape "): float(value) for name, value in numbers.items()
+        if name.startswith("shape ")
+    }  # fmt: skip
+
+
+def most_promising(
+    starts: Sequence[Numbers], trace: Trace, refitted: Mapping[int, float] | None = None
+) -> list[Numbers]:
+    """Of what `best_start` found, the best ones, that gain more than the refit of their column
+    did."""
+    refitted = refitted or {}
+    found = [n for n in starts if "gain" in n]
+    found = [n for n in found if float(n["gain"]) > refitted.get(int(n["column"]), 0.0)]
+    found.sort(key=lambda n: -float(n["gain"]))
     return found[: FITTED_CALLED if simulators(trace) else FITTED]
 
 

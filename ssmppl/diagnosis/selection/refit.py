@@ -8,7 +8,7 @@ expects its top, with what predictions further ahead than one row gain.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -67,6 +67,15 @@ SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from whic
 OPEN, OPEN_SHARE = 5.0, 0.25  # nats, and share of its gain, that a fit may leave and be ranked
 AGAIN = 2  # times that a fit which left more is taken up where it ended
 LOST = 2.0  # nats below the model that it contains: a fit that ends there has failed
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Where the refit of a single effect begins. shape : of it, where that is another than the
+    screen's."""
+
+    strength: float
+    shape: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -403,22 +412,24 @@ def refit_all(
     augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str,
     given: Sequence[Candidate] = (), *, afresh: bool = False, approximate: bool = False,
-    simulation: SimulationGain | None = None, strengths: Sequence[float] | None = None,
+    simulation: SimulationGain | None = None, begins: Sequence[Begin] | None = None,
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
-    """The refits that came to an end, best first, and why the others did not. afresh, approximate,
-    strengths (one for each set) : as of `refit`. simulation : of the model as it is, for
+    """The refits that came to an end, best first, and why the others did not. afresh, approximate :
+    as of `refit`. begins : of each set, of one effect. simulation : of the model as it is, for
     `Refit.ahead`; None: that is 0."""
     shaped = _shaped(
         augmented.fitter(tuple(given)), base, screen, sorted({k for s in sets for k in s}), train,
         seed,
     )  # fmt: skip
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
+    if begins is not None:
+        added = [(*a[:-1], a[-1].with_shape(**b.shape)) for a, b in zip(added, begins, strict=True)]
 
     one = partial(_one, augmented, base, screen, list(sets), tuple(train), seed, added, afresh,
-                  approximate, simulation, strengths)  # fmt: skip
+                  approximate, simulation, begins)  # fmt: skip
     done, reasons = [], []
     results = checkpoint.map(stage, len(sets), one)
-    for index, candidates, numbers in zip(sets, added, results, strict=True):
+    for i, (index, candidates, numbers) in enumerate(zip(sets, added, results, strict=True)):
         name = " and ".join(map(str, candidates))
         if checkpoint.failures.record_task(f"the refit with {name}", numbers):
             continue
@@ -436,6 +447,7 @@ def refit_all(
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
         cost += PRICE * sum(_of_other_length(screen, k, shaped[k]) for k in index)
+        cost += PRICE * bool(begins is not None and begins[i].shape)
         made = Refit(tuple(index), candidates, fitter, fit, gain, cost)
         done.append(made.simulated(train, numbers, simulation))
     done.sort(key=lambda r: -r.score)
@@ -451,11 +463,11 @@ def _one(
     augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
     added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool,
-    simulation: SimulationGain | None, strengths: Sequence[float] | None, k: int,
+    simulation: SimulationGain | None, begins: Sequence[Begin] | None, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
     own = child_seed(seed, Task.REFIT, k)
-    strength = None if strengths is None else strengths[k]
+    strength = None if begins is None else begins[k].strength
     found = refit(
         augmented, base, screen, sets[k], train, own, added[k], afresh, approximate, strength
     )

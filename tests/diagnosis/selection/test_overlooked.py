@@ -13,8 +13,14 @@ from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection import overlooked as module
-from ssmppl.diagnosis.selection.overlooked import best_start, most_promising, overlooked
+from ssmppl.diagnosis.selection.overlooked import (
+    best_start,
+    elsewhere,
+    most_promising,
+    overlooked,
+)
 from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.diagnosis.selection.shapes import shape_bounds
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.statistics.checks import seed_of
@@ -109,9 +115,10 @@ def test_none_where_a_mechanism_gains_most_or_nothing_gains_enough(stopped):
     assert overlooked(screen, [ar1, replace(stop, gain=26.0)], 10.0) == []  # named before
     assert overlooked(screen, [ar1], 51.0) == []
     assert overlooked(screen, [], 0.0) == []
-    behind = overlooked(screen, [ar1, replace(stop, gain=24.0)], 10.0)
-    assert ("hard stop", "upper", "v") not in told(screen, behind)  # refitted already
-    assert ("hard stop", "lower", "v") in told(screen, behind)
+    drag = refit(screen, column(screen, "quadratic drag", "v"), gain=20.0)
+    behind = overlooked(screen, [ar1, replace(stop, gain=24.0), drag], 10.0)
+    assert ("quadratic drag", "", "v") not in told(screen, behind)  # refitted already
+    assert ("hard stop", "upper", "v") in told(screen, behind)  # elsewhere it may gain more
 
 
 def test_no_mechanism_whose_score_has_the_sign_that_is_not_allowed(stopped):
@@ -137,20 +144,40 @@ def test_a_stop_that_simulated_sets_go_beyond_is_found_at_a_finite_strength(stop
     found = best_start(augmented, base, screen, [shapes], train, 0)
     k, strength = int(found["column"]), float(found["strength"])
     c = screen.design.candidates[k]
-    assert dict(c.shape)["h"] > 0.8 * STOP
+    h = elsewhere(found).get("h", dict(c.shape)["h"])
+    assert h > 0.8 * STOP
 
-    def gain(k, strength):
-        c = screen.design.candidates[k]
+    def gain(k, strength, **shape):
+        c = screen.design.candidates[k].with_shape(**shape)
         fitter = augmented.fitter((c,))
         values = base.by_component | {c.strength: strength, f"{c.strength}_h": dict(c.shape)["h"]}
         theta = np.array([values[repr(s)] for s in fitter.problem.trace.parameter_symbols])
         return fitter.value(train, theta) - augmented.base_fitter.value(train, base.theta)
 
-    best = gain(k, strength)
-    assert float(found["gain"]) == pytest.approx(best)
-    assert best > 10.0 * max(screen.efficient.gain[k], 1.0)
-    assert best > max(gain(k, 0.2 * strength), gain(k, 5.0 * strength))
-    assert best > max(gain(other, strength) for other in shapes if other != k)
+    best = gain(k, strength, h=h)
+    assert float(found["gain"]) == pytest.approx(best - module.PRICE * bool(elsewhere(found)))
+    assert best > 5.0 * max(screen.efficient.gain[shapes])
+    assert best > max(gain(k, 0.2 * strength, h=h), gain(k, 5.0 * strength, h=h))
+    assert best - module.PRICE >= max(gain(k, strength) for k in shapes) - 2.0 * module.PRICE
+    low, high = shape_bounds(c, screen.design.scales)["h"]
+    tried = np.linspace(low, high, module.ELSEWHERE + 2)[1:-1]
+    assert best >= max(gain(k, strength, h=v) for v in tried) - module.PRICE
+
+
+def test_a_shape_beyond_those_of_the_screen_is_tried_and_has_its_price(stopped, monkeypatch):
+    """Where the screen's thresholds are all far inside, one further out is found."""
+    augmented, base, screen, train = stopped
+    k = min(
+        (k for k, c in enumerate(screen.design.candidates)
+         if c.form == "upper" and c.effect.name == "hard stop"),
+        key=lambda k: dict(screen.design.candidates[k].shape)["h"],
+    )  # fmt: skip
+    found = best_start(augmented, base, screen, [[k]], train, 0)
+    low, high = shape_bounds(screen.design.candidates[k], screen.design.scales)["h"]
+    assert elsewhere(found)["h"] in np.linspace(low, high, module.ELSEWHERE + 2)[1:-1]
+    assert elsewhere(found)["h"] > dict(screen.design.candidates[k].shape)["h"]
+    monkeypatch.setattr(module, "PRICE", 1e9)
+    assert elsewhere(best_start(augmented, base, screen, [[k]], train, 0)) == {}
 
 
 def test_no_start_where_every_strength_costs(stopped):
@@ -161,8 +188,12 @@ def test_no_start_where_every_strength_costs(stopped):
 
 
 def test_those_that_gain_most_are_fitted(stopped, monkeypatch):
-    starts = [{}, *({"gain": np.array(g)} for g in (1.0, 5.0, 3.0))]
+    starts = [{}, *(
+        {"gain": np.array(g), "column": np.array(k)} for k, g in enumerate((1.0, 5.0, 3.0))
+    )]  # fmt: skip
     trace = stopped[0].trace
     assert [float(n["gain"]) for n in most_promising(starts, trace)] == [5.0, 3.0, 1.0]
+    refitted = most_promising(starts, trace, {1: 6.0, 2: 2.0})  # what a refit has reached already
+    assert [float(n["gain"]) for n in refitted] == [3.0, 1.0]
     monkeypatch.setattr(module, "FITTED", 2)
     assert [float(n["gain"]) for n in most_promising(starts, trace)] == [5.0, 3.0]

@@ -250,8 +250,8 @@ def test_what_is_not_gaussian_has_no_gaussian_predictions(observe):
 
 
 def late(step):
-    """The spring, pushed two rows late and through a lag: states that the inputs determine, and one
-    beside them that looks determined and is not."""
+    """The spring, pushed two rows late and through a lag: states that the inputs determine, and two
+    that look determined and are not: what another one was, and what it is from the start."""
     model = ssm.Model("late spring", inputs=("u",))
 
     @model.prior
@@ -265,19 +265,21 @@ def late(step):
         return {
             "a": ssm.Dirac(0.0), "q": ssm.Normal(0, sd=0.5), "b": ssm.Dirac(0.0),
             "lag": ssm.Dirac(0.1), "v": ssm.Normal(0, sd=0.5), "was": ssm.Dirac(0.0),
+            "off": ssm.Normal(0, sd=0.2),
         }  # fmt: skip
 
     @model.transition
-    def transition(a, b, lag, q, v, u, k, c, s):
+    def transition(a, b, lag, q, v, off, u, k, c, s):
         new = step(q, v, 0.5 * b + 0.5 * lag, k, c)
         return {
             "a": ssm.Dirac(u), "b": ssm.Dirac(a), "lag": ssm.Dirac(0.6 * lag + 0.4 * c * u),
             "q": ssm.Dirac(new["q"]), "v": ssm.Normal(new["v"], sd=s), "was": ssm.Dirac(q),
+            "off": ssm.Dirac(off),
         }  # fmt: skip
 
     @model.observation
-    def observation(q, was, lag):
-        return {"y": ssm.Normal(q + 0.3 * was + 0.1 * lag, sd=0.2)}
+    def observation(q, was, lag, off):
+        return {"y": ssm.Normal(q + 0.3 * was + 0.1 * lag + off, sd=0.2)}
 
     return model
 
@@ -293,7 +295,7 @@ class TestStatesThatTheInputsDetermine:
         rows, found = model.increments_and_predictions(problem.experiments, theta)
         names = [s.data[1] for s in problem.trace.state_symbols]
         kept = [names[k] for k in model._filter(problem.experiments).own]
-        assert sorted(kept) == ["q", "v", "was"]
+        assert sorted(kept) == ["off", "q", "v", "was"]
         for k, at in enumerate(theta):
             known = ssm.kalman_filter(exact, GAPS, dict(zip(AT, at, strict=True)))
             np.testing.assert_allclose(
