@@ -38,6 +38,8 @@ AGAINST = 2.0  # standard deviations by which a score may have the sign that is 
 GRID = (1.0, 4.0, 16.0, 64.0)  # strengths, in standard errors by the data's own information
 ELSEWHERE = 7  # values of a shape between its bounds
 PRICE = 1.0  # nats that a shape elsewhere has to gain
+# Further ones, where it still rises: a threshold further out has larger standard errors.
+BEYOND = (256.0, 1024.0, 4096.0, 16384.0)
 HOPELESS = 20.0  # nats below the model as it is, beyond which larger strengths are not tried
 
 
@@ -95,24 +97,26 @@ def best_start(
     model as it is."""
     level = augmented.base_fitter.value(train, base.theta)
     best, out = level, dict[str, Any]()
-    for k, elsewhere in _every_shape(screen, shapes[i]):
-        c = screen.design.candidates[k].with_shape(**elsewhere)
+    for k, shape in _every_shape(screen, shapes[i]):
+        c = screen.design.candidates[k].with_shape(**shape)
         try:
             fitter = augmented.fitter((c,))
             if only_by_particles(augmented, fitter):
                 continue
             for sign in _signs(c):
-                for strength in sign * _strengths(screen, k):
+                highest, price = -np.inf, PRICE * bool(shape)
+                for n, strength in enumerate(sign * _strengths(screen, k)):
                     start = base.by_parameter | {c.strength: np.asarray(strength)}
                     theta = space_of(fitter.problem, fitter.fixed, start).theta
                     with warnings.catch_warnings():  # of a simulator that is pushed too hard
                         warnings.simplefilter("ignore")
                         value = fitter.value(train, theta)
-                    if value - PRICE * bool(elsewhere) > best:
-                        best = value - PRICE * bool(elsewhere)
+                    if value - price > best:
+                        best = value - price
                         out = {"column": k, "strength": strength, "gain": best - level}
-                        out |= {f"shape {n}": v for n, v in elsewhere.items()}
-                    if not value > level - HOPELESS:
+                        out |= {f"shape {name}": v for name, v in shape.items()}
+                    falls, highest = not value > highest, max(value, highest)
+                    if not value > level - HOPELESS or (falls and n + 1 >= len(GRID)):
                         break
         except SSMError:
             continue
@@ -153,11 +157,12 @@ def _signs(c: Candidate) -> tuple[int, ...]:
 
 
 def _strengths(screen: Screen, k: int) -> np.ndarray:
-    """Strengths (without sign) of a column, inside its bounds, the smallest first."""
+    """Strengths (without sign) of a column, inside its bounds, the smallest first; behind the grid
+    those that are tried while the likelihood rises."""
     squares = screen.simulated.squares[:, [k]]
     share = float(screen.observed.squares[k] / typical_squares(squares)[0])
     share = min(share, 1.0) if share > 0.0 else 1.0
     effect = screen.design.candidates[k].effect
-    size = np.array(GRID) / np.sqrt(screen.efficient.variance[k] * share)
+    size = np.array([*GRID, *BEYOND]) / np.sqrt(screen.efficient.variance[k] * share)
     most = max(abs(effect.lower), abs(effect.upper)) if np.isfinite(effect.upper) else np.inf
     return size[size < most] if np.any(size < most) else np.array([0.5 * most])

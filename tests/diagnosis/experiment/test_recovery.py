@@ -1,5 +1,6 @@
 """Who is taken for whom: the table's arithmetic, and rivals in data simulated with each."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -103,6 +104,15 @@ def test_each_set_is_of_its_truth_and_each_rival_is_at_its_top(late, monkeypatch
             prior = density_of(fit.space, lambda theta: 0.0)(fit.z)
             value = found.simulated[i // module.SETS, i % module.SETS, j]
             assert value == pytest.approx(fit.log_likelihood + prior, abs=0.05)
+
+
+def test_what_the_choice_of_a_shape_is_worth_is_taken_off_everywhere(late, monkeypatch):
+    monkeypatch.setattr(module, "REACH", 0.0)
+    augmented, experiments, (delay, lag) = late
+    found, kept = taken(late)
+    dear, _ = taken((augmented, experiments, [delay, replace(lag, cost=3.0)]), kept)
+    np.testing.assert_allclose(dear.observed, found.observed - [0.0, 3.0])
+    np.testing.assert_allclose(dear.simulated, found.simulated - [0.0, 3.0])
 
 
 def test_of_one_alone_nothing_is_said(late):
