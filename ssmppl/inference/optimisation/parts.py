@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssmppl.inference.optimisation.newton import NO_VALUE
+
 
 @dataclass(frozen=True)
 class Predictions:
@@ -50,10 +52,11 @@ class Parts:
     def information(self, h: np.ndarray, bent: np.ndarray) -> np.ndarray:
         """(F, F) about minus the second derivatives of the sum, of parts at a point and beside it
         (1 + F), or at both sides of it (1 + 2 F), steps `h` (F,) away. bent : (F,) those of the
-        last part."""
-        slopes = None if self.predictions is None else _whitened_slopes(self.predictions, h)
+        last part. What has no value tells nothing."""
+        none = summed(self) == -np.inf
+        slopes = None if self.predictions is None else _whitened_slopes(self.predictions, h, none)
         if slopes is None:
-            slopes = _slopes(self.rows, h)[:, :-1]
+            slopes = _slopes(self.rows, h, none)[:, :-1]
         found: np.ndarray = slopes @ slopes.T
         return found + np.diag(bent)
 
@@ -71,11 +74,11 @@ Increments = Callable[[np.ndarray], np.ndarray | tuple[np.ndarray, Predictions |
 
 
 def summed(values: np.ndarray | Parts) -> np.ndarray:
-    """(B,) of values, or of sums by their parts; -inf where a part is none."""
-    if not isinstance(values, Parts):
-        return values
-    total: np.ndarray = values.rows.sum(axis=1)
-    return np.where(np.isfinite(total), total, -np.inf)
+    """(B,) of values, or of sums by their parts; -inf where a part is none, or the sum is next to
+    overflow."""
+    with np.errstate(all="ignore"):
+        total = values.rows.sum(axis=1) if isinstance(values, Parts) else values
+        return np.where(np.abs(total) < NO_VALUE, total, -np.inf)
 
 
 def parts_of(increments: Increments, theta: np.ndarray, log_prior: np.ndarray) -> Parts:
@@ -93,10 +96,12 @@ def parts_of(increments: Increments, theta: np.ndarray, log_prior: np.ndarray) -
     return Parts(out, predictions)
 
 
-def _slopes(values: np.ndarray, h: np.ndarray) -> np.ndarray:
+def _slopes(values: np.ndarray, h: np.ndarray, none: np.ndarray) -> np.ndarray:
     """(F, ...) of values (1 + F, ...) or (1 + 2 F, ...), on one side where the other has none; 0
-    where neither has."""
+    where neither has. none : (B,) bool, where there is none whatever it is."""
     n = len(h)
+    if none.any():
+        values = np.where(none.reshape(-1, *(1 for _ in values.shape[1:])), np.nan, values)
     middle, up, down = values[0], values[1 : n + 1], values[n + 1 :]
     step = h.reshape(-1, *(1 for _ in middle.shape))
     with np.errstate(invalid="ignore"):
@@ -108,15 +113,15 @@ def _slopes(values: np.ndarray, h: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(slopes), slopes, 0.0)
 
 
-def _whitened_slopes(p: Predictions, h: np.ndarray) -> np.ndarray | None:
+def _whitened_slopes(p: Predictions, h: np.ndarray, none: np.ndarray) -> np.ndarray | None:
     """(F, R (K + K^2)) whose products are the expected information; None where a covariance has no
     root. Of a row it is de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2."""
     try:
         root = np.linalg.inv(np.linalg.cholesky(p.covariance[0]))
     except np.linalg.LinAlgError:
         return None
-    mean = np.einsum("rij,frj->fri", root, _slopes(p.error, h))
-    spread = root @ _slopes(p.covariance, h) @ root.transpose(0, 2, 1) / np.sqrt(2.0)
+    mean = np.einsum("rij,frj->fri", root, _slopes(p.error, h, none))
+    spread = root @ _slopes(p.covariance, h, none) @ root.transpose(0, 2, 1) / np.sqrt(2.0)
     n, rows, channels = mean.shape
     out = np.concatenate(
         [mean.reshape(n, rows * channels), spread.reshape(n, rows * channels**2)], axis=1

@@ -96,6 +96,29 @@ def test_outer_products_stand_in_where_a_covariance_has_no_root():
     np.testing.assert_array_equal(found.information(h, nothing), expected)
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_is_next_to_overflow_is_no_value_and_tells_nothing():
+    """A point beside it runs away, as a model that is pushed too far does."""
+    h, nothing = np.full(4, 1e-5), np.zeros(4)
+    whole = likelihood(beside(TOP, 1e-5, (1.0, -1.0)))
+    known = whole.information(h, nothing)
+    rows, error = whole.rows.copy(), whole.predictions.error.copy()
+    rows[2], error[2] = -1e305, 1e155
+    away = Parts(rows, Predictions(error, whole.predictions.covariance))
+    assert summed(away)[2] == -np.inf
+    np.testing.assert_allclose(away.information(h, nothing), known, rtol=1e-3, atol=0.05)
+    outer = Parts(rows).information(h, nothing)
+    assert np.isfinite(outer).all()
+
+    def runs_away(z):
+        found = likelihood(z)
+        found.rows[z[:, 1] > -1.0] = -1e305
+        return found
+
+    found = climb_together(runs_away, np.array([TOP + [0.5, 0.15, 0.2, 0.2]]), precise=False)
+    assert summed(likelihood(found.z[None]))[0] > summed(likelihood(TOP[None]))[0] - 5.0
+
+
 def test_where_nothing_is_free_there_is_no_information():
     nothing = np.empty(0)
     assert likelihood(TOP[None]).information(nothing, nothing).shape == (0, 0)
