@@ -29,7 +29,8 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     ),
     "classes": ("class_id", "effect", "equation", "rho", "separating_input"),
     "probabilities": (
-        "effect", "equation", "named", "named_equation", "probability", "behind", "cut",
+        "effect", "form", "equation", "named", "named_form", "named_equation", "probability",
+        "behind", "cut",
     ),
     "signals": ("signal", "input", "nats", "note"),
     "closed": (

@@ -36,7 +36,8 @@ HEADINGS = {
     "nats_per_sample": "nats per sample", "gain_mean": "nats, conditional mean",
     "gain_noise": "nats, rest of the distribution", "rmse_before": "error before",
     "rmse_after": "error after", "p": "p", "horizon": "rows ahead", "share": "error reduced by",
-    "low": "from", "high": "to", "named": "came first", "named_equation": "in",
+    "low": "from", "high": "to", "named": "came first", "named_form": "form",
+    "named_equation": "in",
     "probability": "of the sets", "behind": "nats behind, in the data",
     "cut": "nats behind, in 95% of its sets",
 }  # fmt: skip

@@ -253,8 +253,8 @@ def probabilities_table(screen: Screen, found: Recovery) -> pd.DataFrame:
     offered = [screen.design.candidates[k] for k in found.columns]
     named, behind, cuts = found.named, found.behind, found.cuts
     return tabulate("probabilities", [
-        {"effect": c.effect.name, "equation": c.place, "named": d.effect.name,
-         "named_equation": d.place, "probability": float(named[i, j]),
+        {"effect": c.effect.name, "form": c.form, "equation": c.place, "named": d.effect.name,
+         "named_form": d.form, "named_equation": d.place, "probability": float(named[i, j]),
          "behind": float(behind[i]), "cut": float(cuts[i])}
         for i, c in enumerate(offered) for j, d in enumerate(offered)
     ])  # fmt: skip

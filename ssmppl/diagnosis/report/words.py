@@ -147,8 +147,8 @@ def class_letters(report: Findings) -> dict[Any, str]:
 
 
 def alternatives(report: Findings, row: dict[str, Any]) -> list[str]:
-    """The cause and its rivals, by name; many are counted."""
-    others = [row_label(r) for r in rivals(report, row)]
+    """The cause and its rivals, by name, forms of one taken together; many are counted."""
+    others = [n for n in dict.fromkeys(map(row_label, rivals(report, row))) if n != row_label(row)]
     if len(others) > NAMED_RIVALS:
         others = [*others[: NAMED_RIVALS - 1], f"{len(others) - NAMED_RIVALS + 1} more"]
     return [row_label(row), *others]
@@ -518,20 +518,22 @@ def _recognised(report: Findings) -> str:
     """How often the first effect comes first where it is the truth, and which one else."""
     if report.verdict != EFFECT or not (found := leaders(report)):
         return ""
-    own = found[0]["effect"], found[0]["equation"]
-    mine = [r for r in rows(report.probabilities) if (r["effect"], r["equation"]) == own]
-    right = [r for r in mine if (r["named"], r["named_equation"]) == own]
-    if not right:
+    own, table = row_label(found[0]), rows(report.probabilities)
+    mine = table[: math.isqrt(len(table))]  # of the first effect
+    if not mine or row_label(mine[0]) != own:
+        return ""
+    shares: dict[str, float] = {}
+    for r in mine:
+        name = label(r["named"], r["named_equation"])
+        shares[name] = shares.get(name, 0.0) + r["probability"]
+    if len(shares) == 1:  # forms of one effect
         return ""
     text = (
-        f"in data simulated with {label(*own)} on the same inputs, and fitted alike, it came first "
-        f"of {len(mine)} in {percent(right[0]['probability'])} of the sets"
+        f"in data simulated with {own} on the same inputs, and fitted alike, it came first of "
+        f"{len(shares)} in {percent(shares.pop(own))} of the sets"
     )
-    others = sorted((r for r in mine if r not in right), key=lambda r: -r["probability"])
-    if others and others[0]["probability"] > 0.0:
-        other = label(others[0]["named"], others[0]["named_equation"])
-        text += f", {other} in {percent(others[0]['probability'])}"
-    return text
+    other = max(shares, key=lambda name: shares[name])
+    return f"{text}, {other} in {percent(shares[other])}" if shares[other] > 0.0 else text
 
 
 def to_decide(report: Findings) -> list[str]:
@@ -539,12 +541,13 @@ def to_decide(report: Findings) -> list[str]:
     found = report.separation
     if found is None:
         return []
-    names = [label(*e) for e in found.effects]
-    pair = (
-        "between the two" if len(names) == 2 else "between the two that are hardest to tell apart"
-    )
+    names = list(dict.fromkeys(label(*e) for e in found.effects))
+    two = len(found.effects) == 2
+    pair = "between the two" if two else "between the two that are hardest to tell apart"
     needed, recorded = number(found.needed, 2), number(found.recorded, 2)
     out = [f"These records do not tell {listed(names, 'from')}."]
+    if len(names) == 1:
+        out = [f"These records do not tell the forms of {names[0]} apart."]
     if len(names) > 2:
         first = f" (the first {len(names)} of {found.members})" * (found.members > len(names))
         out = [f"These records do not tell {listed(names)} apart{first}."]

@@ -441,3 +441,21 @@ def test_how_often_the_first_effect_is_recognised_is_told():
     assert "came first" not in " ".join(how_sure(effect_found()))
     none = dataclasses.replace(report, verdict="none of these")
     assert "came first" not in " ".join(how_sure(none))
+    # forms of one effect count together, and are no rivals of each other
+    alike = {"state-dependent damping": "quadratic drag"}
+    forms = report.probabilities.replace({"effect": alike, "named": alike})
+    assert "came first" not in " ".join(how_sure(dataclasses.replace(report, probabilities=forms)))
+
+
+def test_forms_of_one_effect_are_named_once():
+    report = recovered()
+    alike = {"state-dependent damping": "quadratic drag"}
+    classes = report.classes.replace({"effect": alike})
+    report = dataclasses.replace(report, classes=classes, causes=report.causes.replace(
+        {"effect": alike}))  # fmt: skip
+    first = leaders(report)[0]
+    assert alternatives(report, first) == ["quadratic drag in v"]
+    found = separation(7.2, 3.1)
+    found = dataclasses.replace(found, effects=(found.effects[0],) * 2)
+    told = to_decide(with_experiment(found))
+    assert told[0] == "These records do not tell the forms of quadratic drag in v apart."

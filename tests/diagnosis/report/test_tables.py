@@ -236,7 +236,7 @@ def test_probabilities_are_of_each_pair():
     sets[0, :, 1] = [-1.0, -2.0, 0.5, -3.0]
     sets[1, :, 0] = -1.0
     found = Recovery((5, 2), np.array([10.0, 8.5]), sets)
-    offered = [SimpleNamespace(effect=SimpleNamespace(name=f"e{k}"), place=f"q{k}")
+    offered = [SimpleNamespace(effect=SimpleNamespace(name=f"e{k}"), place=f"q{k}", form=f"f{k}")
                for k in range(6)]  # fmt: skip
     table = probabilities_table(SimpleNamespace(design=SimpleNamespace(candidates=offered)), found)
     assert table[["effect", "equation", "named", "named_equation"]].values.tolist() == [
@@ -244,6 +244,8 @@ def test_probabilities_are_of_each_pair():
         ["e2", "q2", "e5", "q5"], ["e2", "q2", "e2", "q2"],
     ]  # fmt: skip
     np.testing.assert_allclose(table["probability"], [0.75, 0.25, 0.0, 1.0])
+    assert table["form"].tolist() == ["f5", "f5", "f2", "f2"]
+    assert table["named_form"].tolist() == ["f5", "f2", "f5", "f2"]
     np.testing.assert_allclose(table["behind"], [0.0, 0.0, 1.5, 1.5])
     np.testing.assert_allclose(table["cut"], [0.5, 0.5, 0.0, 0.0])
 
