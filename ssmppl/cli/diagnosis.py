@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,7 +124,9 @@ def diagnose(
     if workers is None:  # Python code holds other threads up, compiled code does not
         workers = min(cpu_count(), MOST_WORKERS) if simulators(trace(loaded)) else 1
     try:
-        with processes(workers) if workers > 1 else nullcontext() as executor:
+        # What the file defines is pickled by name: each process runs it, as it was run here.
+        ready = partial(load_model, model)
+        with processes(workers, ready) if workers > 1 else nullcontext() as executor:
             report: GapReport = ssm.diagnose(
                 loaded, read, names, mode="fast" if fast else mode, alpha=alpha,
                 fixed=held or None, particles=particles, checkpoint=kept, progress=progress,

@@ -337,6 +337,21 @@ def test_a_diagnosis_shares_simulators_over_processes(series, monkeypatch, model
             executor.submit(int)
 
 
+def test_processes_have_what_the_model_file_defines(series, monkeypatch):
+    """Its functions are pickled by name: a simulator of one's own is one of them."""
+    seen = []
+
+    def diagnose(*args, executor, **settings):
+        own = sys.modules["model_file_called"]
+        seen.append(executor.submit(own.double, 21).result())
+        return dataclasses.replace(effect_found(), missing=None)
+
+    write("called.py", CALLED + "\n\ndef double(value):\n    return 2 * value\n")
+    monkeypatch.setattr(ssm, "diagnose", diagnose, raising=False)
+    run("diagnose", "called.py", series, "--workers", 2, "-o", "out")
+    assert seen == [42]
+
+
 def test_of_many_cores_a_diagnosis_takes_some(series, monkeypatch):
     """Each process holds the package and its compiled code."""
     seen = []

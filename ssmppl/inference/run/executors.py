@@ -25,7 +25,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from ssmppl.errors import ArgumentError, ExecutorError
@@ -200,15 +200,27 @@ def threads_unless(executor: Executor | None, tasks: int) -> Iterator[Executor]:
 
 
 @contextmanager
-def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+def processes(
+    workers: int, first: Callable[[], object] | None = None
+) -> Iterator[ProcessPoolExecutor]:
     """So many processes, which leave Ctrl-C to the one that waits for them. The script that asks
-    needs the line `if __name__ == "__main__":`, as each of them imports it."""
+    needs the line `if __name__ == "__main__":`, as each of them imports it.
+
+    first : what each of them calls before its first task, as to have what is pickled by name.
+    """
     context = multiprocessing.get_context("spawn")  # threads are running here: no fork
-    pool = ProcessPoolExecutor(workers, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+    pool = ProcessPoolExecutor(workers, context, _begin, (first,))
     try:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _begin(first: Callable[[], object] | None) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if first is not None:
+        with suppress(Exception):  # a task that needs it says so, where here the pool would break
+            first()
 
 
 def cpu_count() -> int:
