@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,6 +14,7 @@ from ssmppl.diagnosis.selection.equivalence import (
     confidence_set,
     cuts,
     distinguishable,
+    equivalence_classes,
     separating_gain,
     similarity,
 )
@@ -116,3 +119,20 @@ def test_a_confidence_set_with_its_own_cuts():
         confidence_set(np.array([10.0, 7.5, 7.5, np.nan]), np.array([2.0, 2.0, 3.0, 2.0])),
         [True, False, True, False],
     )
+
+
+def test_what_simulated_data_do_not_tell_from_the_best_is_in_its_class():
+    """Two refits that neither correlate nor come near each other: apart, but where data simulated
+    with them say otherwise."""
+    candidates = [SimpleNamespace(effect=SimpleNamespace(cause=c)) for c in ("a", "b", "c")]
+    screen = SimpleNamespace(
+        efficient=SimpleNamespace(rho=np.eye(3), sided=np.zeros(3, int), gain=np.zeros(3)),
+        design=SimpleNamespace(candidates=candidates),
+    )
+    refits = [SimpleNamespace(index=(2,), score=90.0), SimpleNamespace(index=(0,), score=40.0)]
+    order = [2, 0, 1]
+    apart = equivalence_classes(screen, refits, order)
+    assert apart.class_id[0] != apart.class_id[1]
+    together = equivalence_classes(screen, refits, order, {2, 0})
+    assert together.class_id[0] == together.class_id[1] == 1
+    assert together.class_id[2] != 1
