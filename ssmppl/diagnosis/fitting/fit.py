@@ -222,6 +222,13 @@ class Fitter:
     def exact(self) -> bool:
         return isinstance(self.kalman, KalmanModel)
 
+    @property
+    def smooth(self) -> bool:
+        """Whether `value` has no Monte Carlo error."""
+        gaussian = self.problem.program.gaussian
+        filtered = isinstance(gaussian, GaussianApproximation)
+        return self.exact or (filtered and self.settings.proposal == "twisted")
+
     @cached_property
     def simulator(self) -> Simulator:
         """Draws data sets from the model."""

@@ -42,7 +42,10 @@ def best_delay(
     fitter: Fitter, theta: np.ndarray, c: Candidate, train: Sequence[Experiment]
 ) -> Delayed:
     """The delay `c` with the best of all lengths, in the model of a fitter at theta (P,). As it is,
-    with a gain of 0, where none is better than no delay."""
+    with a gain of 0, where none is better than no delay, or where particles estimate the
+    likelihood: the best of many estimates would be so by their error."""
+    if not fitter.smooth:
+        return Delayed(c, 0.0)
     columns = {repr(s): k for k, s in enumerate(fitter.problem.trace.input_symbols)}
     moved = [columns[label] for label in (c.equation, *c.alike)]
     none = best = fitter.value(train, theta)

@@ -44,6 +44,13 @@ def test_what_is_not_late_stays_as_the_screen_has_it():
     assert found.candidate == c
 
 
+def test_estimates_by_particles_choose_no_length(monkeypatch):
+    augmented, experiments, base = late(3)
+    c = candidate("input delay", equation="u").with_shape(delay=2)
+    monkeypatch.setattr(type(augmented.base_fitter), "smooth", False)
+    assert best_delay(augmented.base_fitter, base.theta, c, experiments).candidate == c
+
+
 def test_no_length_beyond_a_share_of_the_record_is_tried(monkeypatch):
     augmented, experiments, base = late(7)
     c = candidate("input delay", equation="u")
