@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
@@ -15,6 +16,7 @@ from ssmppl.codegen.modules.filter_variants import numbered_filter, scored_filte
 from ssmppl.codegen.native import build as native_build
 from ssmppl.codegen.native import loading
 from ssmppl.codegen.native.build import addresses
+from ssmppl.codegen.native.library import function_ir
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.codegen.native.translate import Untranslatable, translate
 from ssmppl.codegen.store import folder
@@ -340,7 +342,43 @@ def test_primitives_are_taken_in():
         np.testing.assert_allclose(values["c"][0], bent.compiled(v, 2.0), rtol=1e-15)
 
 
-@pytest.mark.parametrize("primitive", [raising, with_room], ids=["raises", "allocates"])
+@ssm.primitive
+def moved(q, v, k):
+    for _ in range(10):
+        q, v = q + 0.005 * v, v - 0.005 * k * math.sin(q)
+    return q
+
+
+DERIVATIVES = [(1, 0, 0), (0, 0, 1), (2, 0, 0), (1, 0, 1)]
+
+
+def test_derivatives_of_primitives_are_taken_in():
+    """Though they go on calling the function, which LLVM sees to raise nothing."""
+    found = [moved.difference(index) for index in DERIVATIVES]
+    calls = [f"    c[{k}] = {d.name}(theta[0], theta[1], theta[2])\n" for k, d in enumerate(found)]
+    text = "@exact\ndef run(theta, c):\n" + "".join(calls)
+    values = {"theta": np.array([0.4, -1.3, 9.0]), "c": np.zeros(len(found))}
+    called(addresses("derivatives", text)["run"], ["theta", "c"], values)
+    expected = [d.compiled(*values["theta"]) for d in found]
+    np.testing.assert_allclose(values["c"], expected, rtol=1e-12)
+
+
+def test_functions_taken_in_have_no_names_but_their_own():
+    """Numba counts its names up anew in each process, and what two processes have kept is linked
+    together: then the names would clash."""
+    for d in (moved, moved.difference((1, 0, 0))):
+        module = llvm.parse_assembly(function_ir(d.name, 3, False))
+        seen = [
+            f.name for f in module.functions
+            if not f.is_declaration and f.linkage != llvm.Linkage.internal
+        ]  # fmt: skip
+        assert seen == [f"lib_{d.name}"]
+
+
+@pytest.mark.parametrize(
+    "primitive", [raising, with_room, raising.difference((1,))],
+    ids=["raises", "allocates", "derivative of what raises"],
+)  # fmt: skip
 def test_primitives_that_need_python_are_left_to_numba(primitive):
     with pytest.raises(Untranslatable, match=primitive.name):
         addresses("primitive", f"@exact\ndef run(c):\n    c[0] = {primitive.name}(c[0])\n")

@@ -8,9 +8,10 @@ from typing import Any
 import llvmlite.binding as llvm
 
 from ssmppl.codegen.native.library import function_ir, returned
+from ssmppl.codegen.native.machine import described, make_internal, optimise, target
 from ssmppl.codegen.native.translate import Untranslatable, translate
 from ssmppl.codegen.store import folder
-from ssmppl.compiling import once, one_at_a_time
+from ssmppl.compiling import one_at_a_time
 
 OLDEST = 16  # LLVM from which pointers have no type, as in the text that is written here
 _kept: list[Any] = []  # engines own the code that addresses point to
@@ -28,7 +29,7 @@ def addresses(name: str, text: str) -> Mapping[str, int]:
     if llvm.llvm_version_info[0] < OLDEST:
         raise Untranslatable(f"LLVM {llvm.llvm_version_info[0]} has typed pointers", fix="")
     try:
-        key = f"{name}_{folder.digest_of(text + _machine())}"
+        key = f"{name}_{folder.digest_of(text + described())}"
         if key not in _built:
             _built[key] = _load(key, text)
         return _built[key]
@@ -47,7 +48,7 @@ def _load(key: str, text: str) -> Mapping[str, int]:
     if names is None:
         names = [line[4 : line.index("(")] for line in text.splitlines() if line.startswith("def ")]
     module = llvm.parse_assembly(f'target triple = "{llvm.get_process_triple()}"\n')
-    engine = llvm.create_mcjit_compiler(module, _target())
+    engine = llvm.create_mcjit_compiler(module, target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _kept.append(engine)
@@ -62,7 +63,7 @@ def _compiled(text: str) -> tuple[bytes, list[str]]:
     found = translate(text)
     libraries = [function_ir(*call) for call in sorted(found.calls)]
     declared = [_declaration(*call) for call in sorted(found.calls)]
-    machine = _target()
+    machine = target()
     head = f'target triple = "{llvm.get_process_triple()}"\n'
     head += f'target datalayout = "{machine.target_data}"\n'
     body = found.text.replace("!GROUP", "!0").replace("!LOOP", "!1")
@@ -76,34 +77,11 @@ def _compiled(text: str) -> tuple[bytes, list[str]]:
     for ir in libraries:
         module.link_in(llvm.parse_assembly(ir))
     module.verify()
-    public = set(found.names)
-    for f in module.functions:
-        if f.name not in public and not f.is_declaration:
-            f.linkage = llvm.Linkage.internal
-    options = llvm.create_pipeline_tuning_options(speed_level=3)
-    options.loop_vectorization = True
-    options.slp_vectorization = False
-    builder = llvm.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
+    make_internal(module, set(found.names))
+    optimise(module, 3)
     return machine.emit_object(module), found.names
 
 
 def _declaration(name: str, arity: int, draws: bool) -> str:
     numbers = ["ptr", "i64"] * draws + ["double"] * arity
     return f"declare {returned(name)} @lib_{name}({', '.join(numbers)})"
-
-
-@once
-def _target() -> Any:
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    target = llvm.Target.from_default_triple()
-    return target.create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3,
-        jit=True,
-    )  # fmt: skip
-
-
-def _machine() -> str:
-    """What compiled code depends on beside its text."""
-    return f"{llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"

@@ -16,6 +16,7 @@ import llvmlite.binding as llvm
 import numba
 from numba import float64, types
 
+from ssmppl.codegen.native.machine import make_internal, optimise
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.store import folder
 from ssmppl.compiling import once
@@ -54,7 +55,9 @@ def _made(name: str, arity: int, draws: bool) -> str:
     dispatcher: Any = getattr(getattr(module, name), "bare", None)
     if dispatcher is None:  # Numba is switched off
         raise Untranslatable(f"{name} is not compiled", fix="")
-    return _wrapped(_compiled(dispatcher, name, arity, draws), name, arity, draws)
+    compiled = _compiled(dispatcher, name, arity, draws)
+    text = compiled.library.get_llvm_str()
+    return _wrapped(text, compiled.fndesc.llvm_func_name, name, arity, draws)
 
 
 def _compiled(dispatcher: Any, name: str, arity: int, draws: bool = False) -> Any:
@@ -73,11 +76,15 @@ def _of_primitive(name: str, arity: int) -> str:
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     options |= {k: v for k, v in made.targetoptions.items() if k != "nopython"}
     compiled = _compiled(numba.njit(**options)(made.py_func), name, arity)
-    text: str = compiled.library.get_llvm_str()
-    inner = re.escape(_quoted(compiled.fndesc.llvm_func_name))
-    (body,) = re.findall(rf"^define [^\n]*@{inner}\(.+?^}}", text, re.MULTILINE | re.DOTALL)
+    inner = compiled.fndesc.llvm_func_name
+    module = llvm.parse_assembly(compiled.library.get_llvm_str())
+    # Within one module LLVM sees that what it calls never raises: then it returns the constant 0.
+    make_internal(module, {inner})
+    optimise(module, 1)
+    text = str(module)
+    symbol = re.escape(_quoted(inner))
+    (body,) = re.findall(rf"^define [^\n]*@{symbol}\(.+?^}}", text, re.MULTILINE | re.DOTALL)
     returned = re.findall(r"^ +ret i32 ([^,\n]+)", body, re.MULTILINE)
-    module = llvm.parse_assembly(text)
     outside = [
         x.name for x in (*module.functions, *module.global_variables)
         if x.is_declaration and not x.name.startswith("llvm.")
@@ -86,15 +93,18 @@ def _of_primitive(name: str, arity: int) -> str:
         raise Untranslatable(f"{name} may raise an exception", fix="")
     if compiled.library.has_dynamic_globals or not all(map(_of_libm, outside)):
         raise Untranslatable(f"{name} needs {', '.join(outside) or 'addresses'}", fix="")
-    return _wrapped(compiled, name, arity, False)
+    # Numba counts functions up in each process: their names are no names for others.
+    module = llvm.parse_assembly(_wrapped(text, inner, name, arity, False))
+    make_internal(module, {f"lib_{name}"})
+    return str(module)
 
 
 def _of_libm(name: str) -> bool:
     return re.fullmatch("[a-z][a-z0-9]*", name) is not None and bool(llvm.address_of_symbol(name))
 
 
-def _wrapped(compiled: Any, name: str, arity: int, draws: bool) -> str:
-    inner = compiled.fndesc.llvm_func_name
+def _wrapped(text: str, inner: str, name: str, arity: int, draws: bool) -> str:
+    """The text of a function that Numba compiled, and of one that calls it by floats alone."""
     numbers = [f"double %x{k}" for k in range(arity)]
     # An array goes to Numba's functions as (parent, owner, items, item size, data, shape, stride).
     array = ["ptr null", "ptr null", "i64 %n", "i64 8", "ptr %rng", "i64 %n", "i64 8"]
@@ -110,7 +120,7 @@ define linkonce_odr {kind} @lib_{name}({given}) alwaysinline nounwind {{
   ret {kind} %value
 }}
 """
-    return compiled.library.get_llvm_str() + wrapper
+    return text + wrapper
 
 
 def returned(name: str) -> str:
