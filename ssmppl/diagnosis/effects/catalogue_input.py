@@ -8,7 +8,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.diagnosis.effects.effect import Auxiliary, declared, effect, numbers, rows, sds, sizes
+from ssmppl.diagnosis.effects.effect import (
+    MOST_DELAYED,
+    Auxiliary,
+    declared,
+    effect,
+    numbers,
+    rows,
+    sds,
+    sizes,
+)
 from ssmppl.language.distributions import Dirac, Normal
 
 
@@ -46,6 +55,9 @@ def input_offset(u, strength):
 
 
 # -- with memory
+BEFORE = numbers(1, 0)  # of the first value: an input that was held before the record, or was off
+
+
 @effect(on="input", kind="state", name="backlash", lower=0, upper=2, states=("held",),
         shapes={"c": sds(0.25, 0.75, between=(0.125, 3.0))})  # fmt: skip
 def backlash(u, held, strength, c):
@@ -54,22 +66,25 @@ def backlash(u, held, strength, c):
     return Auxiliary(u + strength * (follows - u), {"held": Dirac(follows)}, {"held": Dirac(u)})
 
 
-@effect(on="input", kind="state", name="input delay", lower=0, upper=2, states={"past": "delay"},
-        shapes={"delay": numbers(1, 2, 4)}, common=True)  # fmt: skip
-def input_delay(u, past, strength, delay):
-    """u_t + l (u_{t - delay} - u_t)"""
+@effect(on="input", kind="state", name="input delay", lower=0, upper=MOST_DELAYED,
+        states={"past": "delay"}, common=True,
+        shapes={"delay": numbers(1, 2, 4), "before": BEFORE})  # fmt: skip
+def input_delay(u, past, strength, delay, before):
+    """u_t + l (u_{t - delay} - u_t), u before the record `before` times its first value"""
     newest_first = np.stack([u, *past[:-1]])
     return Auxiliary(u + strength * (past[-1] - u), {"past": Dirac(newest_first)},
-                     {"past": Dirac(np.stack([u] * int(delay)))})  # fmt: skip
+                     {"past": Dirac(np.stack([before * u] * int(delay)))})  # fmt: skip
 
 
 @effect(on="input", kind="state", name="actuator lag", lower=0, upper=2, states=("lagged",),
-        shapes={"k": numbers(2, 5, 15, between=(1.0, 60.0))}, common=True)  # fmt: skip
-def actuator_lag(u, lagged, strength, k):
-    """u + l (w - u), w following u with the time constant of k rows"""
+        shapes={"k": numbers(2, 5, 15, between=(1.0, 60.0)), "before": BEFORE},
+        common=True)  # fmt: skip
+def actuator_lag(u, lagged, strength, k, before):
+    """u + l (w - u), w following u with the time constant of k rows, from `before` times the first
+    u on"""
     follows = lagged + (u - lagged) / k
     return Auxiliary(u + strength * (follows - u), {"lagged": Dirac(follows)},
-                     {"lagged": Dirac(u)})  # fmt: skip
+                     {"lagged": Dirac(before * u)})  # fmt: skip
 
 
 # -- parameters: of positive ones the logarithm changes

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from ssmppl.diagnosis.effects.effect import (
+    MOST_DELAYED,
     Auxiliary,
     declared,
     effect,
@@ -88,7 +89,7 @@ def sensor_lag(h, sensed, strength, k, start):
                      {"sensed": Dirac(start)})  # fmt: skip
 
 
-@effect(on="channel", kind="state", name="sensor delay", lower=0, upper=2,
+@effect(on="channel", kind="state", name="sensor delay", lower=0, upper=MOST_DELAYED,
         states={"earlier": "delay"},
         shapes={"delay": numbers(1, 3), "start": firsts(1.0)})  # fmt: skip
 def sensor_delay(h, earlier, strength, delay, start):

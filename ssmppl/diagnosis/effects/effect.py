@@ -70,6 +70,10 @@ from ssmppl.language.model.pickling import holder_of
 _MISSING: Any = None
 Bounds = tuple[float, float] | None
 
+# The most strength of a delay. Beyond 1 it extrapolates, and one of two rows at twice the strength
+# passes for one of four; what is over leaves an estimate near 1 its error.
+MOST_DELAYED = 1.25
+
 # The words of a declaration: see the tables above.
 KINDS = ("transition", "observation", "input", "noise", "tail", "parameter", "initial", "state")
 GIVEN = (

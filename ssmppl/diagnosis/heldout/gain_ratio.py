@@ -313,6 +313,8 @@ class HeldOutGain:
     """Rows of the report's table, free runs of each experiment before and after, and notes.
 
     beyond_catalogue : what the reference gains over the best of the catalogue, chosen or not.
+    curves : whether the reference has smooth functions, which predict rows that they were not
+        fitted to better than the chosen model.
     simulated_beyond : the share of what it takes off the error of simulations that is left by what
         was chosen, and the lower end of the interval of how much better than that it simulates;
         None where that was not measured.
@@ -323,6 +325,7 @@ class HeldOutGain:
     before: list[FreeRun] = field(default_factory=list)
     after: list[FreeRun] | None = None
     notes: list[str] = field(default_factory=list)
+    curves: bool = False
     simulated_beyond: tuple[float, float] | None = None
 
     def simulate(
@@ -404,6 +407,7 @@ class HeldOutRows:
             return
         model = (chosen.fitter, chosen.fit) if chosen else reference
         same = reference[1] is model[1]  # nothing was found beyond the chosen effects
+        out.curves = reference[1] is not (chosen.fit if chosen else self.base[1])
         found = best if same else predict(*model, experiments, counts, seed)
         ratio = gain_ratio(
             plain.log_density, found.log_density, best.log_density, starts=plain.starts

@@ -72,8 +72,8 @@ def fit_reference(
 
     A fit that comes out below where it started has gone astray (a feedback of what is past that
     makes the model unstable): then with the best group alone, and at last with none. Where there
-    is a `split`, the curves, fitted to the first rows, have to predict the rows of the second part
-    better than the model without them does: what only bends through the noise is left out.
+    is a `split`, a group of curves has to predict the rows of the second part, fitted to the first
+    rows, better than the model without it does: what only bends through the noise is left out.
 
     Raises
     ------
@@ -81,11 +81,11 @@ def fit_reference(
     """
     groups = significant_groups(screen, chosen)
     if groups and split is not None:
-        gained = checkpoint.computed(
+        found = checkpoint.computed(
             "reference on other rows",
-            lambda: {"nats": _gained(augmented, chosen, start, groups, split, seed)},
+            lambda: {"groups": _worth(augmented, chosen, start, groups, split, seed)},
         )
-        groups = groups if float(gained["nats"]) > 0.0 else []
+        groups = groups[: int(found["groups"])]
     for count in dict.fromkeys((len(groups), min(1, len(groups)))):
         fitter, begin = superset(augmented, chosen, start, groups[:count])
 
@@ -101,21 +101,24 @@ def fit_reference(
     return augmented.fitter(chosen), start
 
 
-def _gained(
+def _worth(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
     groups: Sequence[tuple[list[BasisTerm], float]], split: RowSplit, seed: np.random.SeedSequence,
 ) -> np.ndarray:  # fmt: skip
-    """() nats by which the superset predicts the second part better; -inf where it has no fit."""
-    gains = []
-    for wanted in ([], groups):
-        fitter, begin = superset(augmented, chosen, start, wanted)
+    """() how many groups, one after the other, predict the second part better than those before."""
+    best = -np.inf
+    for count in range(len(groups) + 1):
+        fitter, begin = superset(augmented, chosen, start, groups[:count])
         try:
             fit = fitter.fit(split.reference_train, seed, begin, FROM_NEARBY)
             found = predict(fitter, fit, split.train, split.reference_validation, seed)
         except SSMError:
-            return np.asarray(-np.inf)
-        gains.append(found.log_density.sum(axis=1).mean())
-    return np.asarray(gains[1] - gains[0])
+            return np.asarray(max(count - 1, 0))
+        value = found.log_density.sum(axis=1).mean()
+        if not value > best:
+            return np.asarray(max(count - 1, 0))
+        best = value
+    return np.asarray(len(groups))
 
 
 def superset(

@@ -1,8 +1,10 @@
 """The basis in which a missing term is written, as candidates that need no form to be guessed.
 
 For every equation with noise: increments of its mean by smooth functions of each state and input,
-by products of two of them, and by the past of what moves the system; and increments of the log of
-its variance by smooth functions. Their scores tell where the gap is, whatever its form.
+by products of two of them, by what goes up and down with a state (a cogging, a ripple, a kink: a
+Fourier series, alone and times each input), and by the past of what moves the system; and
+increments of the log of its variance by smooth functions. Their scores tell where the gap is,
+whatever its form.
 
 The functions are polynomials in s = tanh(z / `BEND`), z the standardised variable, orthonormal over
 its values: next to polynomials in z where the data are, and level beyond them. (Hermite functions,
@@ -40,6 +42,9 @@ REACH = 6.0  # the time constant of each, in rows
 RING = ("ring_1", "ring_2")  # a resonance: what is in step with it, and a quarter turn behind
 # Rows to a turn: so close that with a ring that dies away within a turn none between two is missed.
 TURNS = tuple(6.0 * 1.4**k for k in range(7))
+# Waves of a state in four of its standard deviations: finer than the curves follow, and so close
+# that of a wave between two of them these hold four fifths. Beyond, they are level.
+WAVES, EITHER_SIDE = (2, 3, 4, 5, 6), 2.0
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,7 @@ class BasisTerm:
     moment : "mean" or "scale". variable : what it is a function of, in words. function : of a
     single variable, with its centre and width; None of products and of what is past. factors : the
     variables, each with the number of its function in `CURVES`, from 1; none of what is past.
+    fine : whether it is of the Fourier series, which are looked at apart: they are many.
     """
 
     candidate: Candidate
@@ -121,6 +127,7 @@ class BasisTerm:
     centre: float = 0.0
     width: float = 1.0
     factors: tuple[tuple[str, int], ...] = ()
+    fine: bool = False
 
     @property
     def is_curve(self) -> bool:
@@ -150,6 +157,7 @@ def basis(trace: Trace, scales: Scales) -> list[BasisTerm]:
             out += [_curve(part, "mean", kind, v, k, scales) for v in read for k in range(MEAN)]
             if state:
                 out += _products(part, own, scales)
+                out += _fourier(part, own, scales)
                 moving = [v for v in own if v in noisy or v.role == "input"]
                 out += [_past(part, v, k, scales) for v in moving for k in range(len(PAST))]
                 driving = [v for v in moving if v is part or v.role == "input"]
@@ -231,6 +239,42 @@ def _product(first: Smooth, second: Smooth) -> Callable[..., Any]:
         return strength * first((z - centre) / width) * second((w - centre_w) / width_w)
 
     return term
+
+
+def _fourier(part: Part, variables: Sequence[Part], scales: Scales) -> list[BasisTerm]:
+    """Waves of each state, and these times each input; with many variables the waves alone."""
+    inputs = [v for v in variables if v.role == "input"] if len(variables) <= FEW else []
+    out = []
+    for state in (v for v in variables if v.role == "state"):
+        x = scales.scale[state.label]
+        for times in (None, *inputs):
+            shape, bound = {"centre": x.mean, "width": x.sd}, {"z": state}
+            name = f"a Fourier series in {state.label}"
+            if times is not None:
+                y = scales.scale[times.label]
+                shape |= {"centre_w": y.mean, "width_w": y.sd}
+                bound, name = {**bound, "w": times}, f"{name} times {times.label}"
+            for waves in WAVES:
+                for wave, of in ((np.cos, "cos"), (np.sin, "sin")):
+                    found = _term(
+                        part, "mean", name, f"{of} {waves} of {name}", "transition",
+                        _wave(wave, waves, times is not None), shape, bound,
+                        f"{of} {waves} {part.label} {state.label} {times.label if times else ''}",
+                    )  # fmt: skip
+                    out.append(replace(found, fine=True))
+    return out
+
+
+def _wave(wave: Callable[..., Any], waves: int, with_input: bool) -> Callable[..., Any]:
+    angle = np.pi * waves / EITHER_SIDE
+
+    def alone(own, z, strength, centre, width):
+        return strength * wave(angle * np.clip((z - centre) / width, -EITHER_SIDE, EITHER_SIDE))
+
+    def times(own, z, w, strength, centre, width, centre_w, width_w):
+        return alone(own, z, strength, centre, width) * (w - centre_w) / width_w
+
+    return times if with_input else alone
 
 
 def _past(part: Part, variable: Part, k: int, scales: Scales) -> BasisTerm:

@@ -45,12 +45,13 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, B
     (`bonferroni`)."""
     observed, nuisance = screen.observed, screen.simulated.nuisance
     columns, terms = screen.simulated.basis, screen.design.terms
-    keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
-    if not keys:
+    places: dict[tuple[str, str, bool], list[int]] = {}
+    for i, t in enumerate(terms):
+        places.setdefault((t.equation, t.moment, t.fine), []).append(i)
+    if not places:
         return tabulate("where"), {}
-    places = {k: [i for i, t in enumerate(terms) if (t.equation, t.moment) == k] for k in keys}
     groups: dict[Hashable, Any] = {k: (columns[:, p], observed.basis[p]) for k, p in places.items()}
-    table, found = localise(groups, nuisance, observed.nuisance)
+    table, found = localise(groups, nuisance, observed.nuisance, {k: k[:2] for k in places})
     starts, edges = starts_of(screen.experiments), screen.edges
     labels = _labels(screen.experiments)
     bins, own = screen.simulated.basis_bins, screen.simulated.nuisance_bins
@@ -68,11 +69,12 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, B
         rows.append({
             "equation": key[0], "moment": key[1], "t_from": labels[stretch[0]],
             "t_to": labels[stretch[1] - 1], "z": max(row.z, row.z_alone), "p": p,
-            "region": _region(screen, key, places[key]) if p <= alpha else "",
+            "region": _region(screen, places[key]) if p <= alpha else "",
             "experiment": _experiments(starts, *stretch),
         })  # fmt: skip
     rows.sort(key=lambda r: (r["p"], -r["z"]))
-    return tabulate("where", rows), found
+    first = {(r["equation"], r["moment"]): r for r in reversed(rows)}
+    return tabulate("where", [r for r in rows if first[r["equation"], r["moment"]] is r]), found
 
 
 def _labels(experiments: Sequence[Experiment]) -> list[Any]:
@@ -91,7 +93,7 @@ def _experiments(starts: Sequence[int], first: int, last: int) -> str:
     return str(a) if a == b else f"{a} to {b}"
 
 
-def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
+def _region(screen: Screen, places: list[int]) -> str:
     """Where the strongest of the variables shows the gap most, in words."""
     terms, best = screen.design.terms, None
     for variable in dict.fromkeys(terms[i].variable for i in places):

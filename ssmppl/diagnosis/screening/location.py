@@ -138,10 +138,12 @@ def localise(
     groups: Mapping[Hashable, tuple[np.ndarray, np.ndarray]],
     nuisance: np.ndarray,
     observed_nuisance: np.ndarray,
+    places: Mapping[Hashable, Hashable] | None = None,
 ) -> tuple[pd.DataFrame, dict[Hashable, BasisGroupScore]]:
-    """Each group with all others projected out; p family-wise over the groups.
+    """Each group with those of all other places projected out; p family-wise over the groups.
 
-    groups : by key, for instance (equation, moment): columns (B, D) and observed (D,).
+    groups : by key, for instance (equation, moment): columns (B, D) and observed (D,). places : of
+        each key; None: each is its own.
 
     Returns
     -------
@@ -153,10 +155,11 @@ def localise(
     import pandas as pd
 
     keys = list(groups)
+    at = {k: k for k in keys} if places is None else places
     alone, given_others = [], []
     for key in keys:
         columns, observed = groups[key]
-        rest = [groups[k] for k in keys if k != key]
+        rest = [groups[k] for k in keys if at[k] != at[key]]
         alone.append(group_score(columns, observed, nuisance, observed_nuisance))
         others = np.hstack([c for c, _ in rest]) if rest else None
         seen = np.hstack([o for _, o in rest]) if rest else None

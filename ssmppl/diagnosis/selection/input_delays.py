@@ -51,10 +51,14 @@ def best_delay(
     none = best = fitter.value(train, theta)
     out = Delayed(c, 0.0)
     for rows in range(1, min(MOST, int(SHARE * max(e.steps for e in train))) + 1):
-        value = fitter.value([_later(e, moved, rows) for e in train], theta)
-        if value > best:
-            best, out = value, Delayed(c.with_shape(delay=rows), value - none)
-        if not value > best - HOPELESS:
+        here = -np.inf
+        for before in c.effect.shapes["before"].values:
+            value = fitter.value([_later(e, moved, rows, before) for e in train], theta)
+            if value > best:
+                shaped = c.with_shape(delay=rows, before=before)
+                best, out = value, Delayed(shaped, value - none)
+            here = max(here, value)
+        if not here > best - HOPELESS:
             break
     return out
 
@@ -72,9 +76,9 @@ def promising_delays(
     return sorted((k for k, gain in found.items() if gain >= worth), key=lambda k: -found[k])
 
 
-def _later(e: Experiment, columns: Sequence[int], rows: int) -> Experiment:
-    """The experiment with these inputs so many rows later; before, as they begin."""
+def _later(e: Experiment, columns: Sequence[int], rows: int, before: float) -> Experiment:
+    """The experiment with these inputs so many rows later; before, so many times their first."""
     u = e.u.copy()
     for k in columns:
-        u[:, k] = np.concatenate([np.repeat(e.u[:1, k], rows), e.u[:, k]])[: e.steps]
+        u[:, k] = np.concatenate([np.repeat(before * e.u[:1, k], rows), e.u[:, k]])[: e.steps]
     return replace(e, u=u)

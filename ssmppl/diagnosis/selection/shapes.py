@@ -90,8 +90,9 @@ def shaped_all(
             made = _reshaped(old.candidates, scales, shapes, numbers["lengths"])
             fitter = augmented.fitter(made)
             fit = fitter.restored(train, numbers)
-            moved = sum(_whole(old.candidates) != numbers["lengths"])
-            cost = old.cost + PRICE * (len(shapes) + moved)
+            moved = np.sum(_whole(old.candidates) != numbers["lengths"])
+            moved += np.sum(_estimable(old, scales) != shapes)
+            cost = old.cost + PRICE * moved
             gain = fit.log_likelihood - base.log_likelihood
             new = Refit(old.index, made, fitter, fit, gain, cost)
             new = new.simulated(train, numbers, simulation)
@@ -108,7 +109,7 @@ def _one(
     r = _with_lengths(augmented, refits[k], train, child_seed(seed, k))
     found = _shaped(augmented, scales, r, train, child_seed(seed, k))
     if not found and r is not refits[k]:
-        found = {**r.fit.numbers, "shapes": np.empty(0)}
+        found = {**r.fit.numbers, "shapes": _estimable(r, scales)}
     if not found:
         return found
     found["lengths"] = _whole(r.candidates)
@@ -208,6 +209,11 @@ def _bounded(r: Refit, scales: Scales) -> dict[str, tuple[float, float, float]]:
         for c in r.candidates
         for name, (low, high) in shape_bounds(c, scales).items()
     }
+
+
+def _estimable(r: Refit, scales: Scales) -> np.ndarray:
+    """The values of all shapes that can be estimated, in order."""
+    return np.array([value for _, _, value in _bounded(r, scales).values()], dtype=float)
 
 
 def _whole(candidates: Sequence[Candidate]) -> np.ndarray:

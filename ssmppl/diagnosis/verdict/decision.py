@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.effects.effect import NOISE_LAW
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain
 from ssmppl.diagnosis.heldout.reference import residual_groups
 from ssmppl.diagnosis.heldout.simulation import WINDOWED
@@ -63,6 +64,8 @@ def decide(r: Results, where: pd.DataFrame, checks: pd.DataFrame) -> Decision:
             found = Decision(NO_GAP)
         elif unlike:
             found = Decision(EFFECT, strongest_mean(where))
+    if found.verdict == EFFECT and (place := _open_mean(r)) is not None:
+        found = _none_of_these(place, r.chosen.candidates if r.chosen else ())
     # Places and checks that are of a fit which was not the best one say nothing.
     if found.verdict == NO_GAP and r.screen_is_current and stands_out(r.alpha, where, checks):
         found = Decision(NONE_OF_THESE, strongest_mean(where))
@@ -87,6 +90,18 @@ def _by_effects(r: Results, where: pd.DataFrame) -> Decision:
         if residual <= RESIDUAL_ALPHA_SHARE * r.alpha and place is not None:
             return _none_of_these(place, tried)
     return Decision(NO_GAP)
+
+
+def _open_mean(r: Results) -> Place | None:
+    """The mean that something is missing from though only laws of the noise were chosen: it stands
+    out beside them, and curves of it predict rows that they were not fitted to. Noise that grows
+    with what moves a state describes any missing term of that."""
+    if r.chosen is None or r.held_out is None or not r.held_out.curves:
+        return None
+    if any(c.effect.cause != NOISE_LAW for c in r.chosen.candidates):
+        return None
+    residual, place = strongest_residual(r.screen, r.chosen.candidates)
+    return place if residual <= r.alpha and place is not None and place[1] == "mean" else None
 
 
 def _none_of_these(place: Place, tried: Sequence[Candidate]) -> Decision:

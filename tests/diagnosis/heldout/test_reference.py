@@ -1,6 +1,7 @@
 """The reference: what it does with fits that go astray."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,44 @@ from ssmppl.diagnosis.fitting.fit import FROM_START, Fitter
 from ssmppl.diagnosis.heldout import reference
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.errors import SamplingError
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.diagnosis.model.test_basis import THETA, asked, simulated
 
 FIXED = {n: np.asarray(v) for n, v in THETA.items() if n != "phi"}
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([1.0, 2.0, 3.0, 4.0], 3),
+        ([1.0, 2.0, 1.5, 9.0], 1),  # what comes after one that does not help is not looked at
+        ([1.0, 0.5, 3.0, 4.0], 0),
+        ([1.0, None, 3.0, 4.0], 0),  # no fit
+        ([None, 2.0, 3.0, 4.0], 0),
+    ],
+)
+def test_groups_are_taken_in_as_long_as_each_predicts_other_rows_better(
+    monkeypatch, values, expected
+):
+    def fit(count):
+        if values[count] is None:
+            raise SamplingError("it has no fit", fix="none")
+        return values[count]
+
+    monkeypatch.setattr(
+        reference, "superset",
+        lambda augmented, chosen, start, groups: (
+            SimpleNamespace(fit=lambda *_: fit(len(groups))), {}
+        ),
+    )  # fmt: skip
+    monkeypatch.setattr(
+        reference, "predict",
+        lambda fitter, value, *_: SimpleNamespace(log_density=np.full((3, 2), value / 2)),
+    )  # fmt: skip
+    split = SimpleNamespace(reference_train=None, train=None, reference_validation=None)
+    found = reference._worth(None, (), None, [([], 1.0)] * 3, split, None)
+    assert int(found) == expected
 
 
 @pytest.mark.slow

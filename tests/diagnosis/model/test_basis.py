@@ -86,6 +86,8 @@ def test_what_it_holds(plain):
         found[t.equation, t.moment, t.variable] += 1
     assert found == {
         ("x", "mean", "x"): 4, ("x", "mean", "u"): 4, ("x", "mean", "x and u"): 6,
+        ("x", "mean", "a Fourier series in x"): 10,
+        ("x", "mean", "a Fourier series in x times u"): 10,
         ("x", "mean", "the past of x"): 3, ("x", "mean", "the past of u"): 3,
         **{("x", "mean", f"the ringing of {v} at {turn:.0f} rows"): 2
            for v in ("x", "u") for turn in TURNS},
@@ -93,6 +95,7 @@ def test_what_it_holds(plain):
         ("y", "mean", "x"): 4, ("y", "scale", "x"): 2,
     }  # fmt: skip
     assert all(t.is_curve == (t.variable in ("x", "u")) for t in terms)
+    assert all(t.fine == ("Fourier" in t.variable) for t in terms)
 
 
 def test_what_is_past_shares_its_states_and_its_scale(plain):
@@ -174,6 +177,37 @@ def test_a_resonance_is_found_at_its_own_frequency(turn):
     assert best[2].startswith("the ringing of")
     found = float(best[2].split(" at ")[1].split()[0])
     assert turn / 1.5 <= found <= turn * 1.5
+
+
+@pytest.mark.parametrize("frequency", [4.0, 7.5])
+@pytest.mark.parametrize("times", ["", " times u"])
+def test_a_ripple_over_a_state_is_found(frequency, times):
+    """Of so many radians in a standard deviation of it: finer than the curves follow, and between
+    the waves that are tried. The table has one row for the place, with the finer of the two."""
+    sd, size = 0.9, 0.4
+
+    def missing(x, w, u):
+        return size * np.sin(frequency * x / sd) * (u if times else 1.0)
+
+    screen = asked(simulated(missing, f"ripple {frequency}{times}"))
+    groups = reference.residual_groups(screen, ())
+    best = max((key for key in groups if key[1] == "mean"), key=lambda key: groups[key].z)
+    assert best == ("x", "mean", f"a Fourier series in x{times}")
+    assert groups[best].p <= 0.01
+    table, _ = tables.where_table(screen, 0.05)
+    assert not table.duplicated(["equation", "moment"]).any()
+    (row,) = table[(table["equation"] == "x") & (table["moment"] == "mean")].itertuples()
+    assert row.region == f"with a Fourier series in x{times}"
+
+
+def test_waves_are_level_where_the_data_seldom_are(plain):
+    """Two standard deviations off a record tells nothing of the next ripple."""
+    (term,) = [t for t in plain.design.terms if t.candidate.strength == "sin_3_x_x"]
+    function, shape = term.candidate.effect.function, {"centre": 1.0, "width": 0.5}
+    inside = [float(function(0.0, z, 2.0, **shape)) for z in (1.1, 1.25)]
+    assert inside == pytest.approx(2.0 * np.sin(3 * np.pi / 2 * np.array([0.2, 0.5])))
+    outside = [float(function(0.0, z, 2.0, **shape)) for z in (2.0, 5.0, 0.0, -7.0)]
+    assert outside == pytest.approx(2.0 * np.sin(3 * np.pi * np.array([1, 1, -1, -1])), abs=1e-12)
 
 
 def test_nothing_stands_out_of_a_right_model(plain):

@@ -36,6 +36,25 @@ def test_the_length_is_found_and_its_gain_is_that_of_the_delay_as_an_effect(rows
     assert found.gain == pytest.approx(gain, abs=1e-6)
 
 
+def test_an_input_may_have_been_off_before_the_record():
+    """Then the first rows have none of it, and the effect with that start fits them."""
+    rows = 4
+    augmented, experiments, base = setting(np.r_[np.zeros(rows), INPUT[: ROWS - rows]] - INPUT)
+    c = candidate("input delay", equation="u")
+    found = best_delay(augmented.base_fitter, base.theta, c, experiments)
+    assert dict(found.candidate.shape) == {"delay": rows, "before": 0}
+    values = []
+    for before in (0, 1):
+        fitter = augmented.fitter((c.with_shape(delay=rows, before=before),))
+        start = base.by_parameter | {c.strength: np.asarray(1.0)}
+        values.append(
+            fitter.value(experiments, space_of(fitter.problem, fitter.fixed, start).theta)
+        )
+    value = augmented.base_fitter.value(experiments, base.theta)
+    assert found.gain == pytest.approx(values[0] - value, abs=1e-6)
+    assert values[0] > values[1] + 1.0
+
+
 def test_what_is_not_late_stays_as_the_screen_has_it():
     augmented, experiments, base = late(0)
     c = candidate("input delay", equation="u").with_shape(delay=2)

@@ -136,6 +136,24 @@ def test_the_period_ends_where_the_likelihood_is_highest(forced):
     assert np.all(np.linalg.eigvalsh(measured.information) > 0.0)
 
 
+def test_a_length_may_move_where_the_other_shapes_cannot_be_estimated(monkeypatch):
+    """Then these stay what they were, and cost nothing."""
+    u = models.inputs_of("oscillator", ROWS)["u"]
+    augmented, experiments, base = setting(np.r_[[u[0]] * 4, u[:-4]] - u)
+    late, friction = candidate("input delay", equation="u"), candidate("coulomb friction")
+    pair = late.with_shape(delay=2), friction
+    fitter = augmented.fitter(pair)
+    start = base.by_parameter | {late.strength: np.asarray(1.0), friction.strength: np.asarray(0.1)}
+    fit = fitter.fit(experiments, seed_sequence(2), start, FROM_START)
+    found = Refit((0, 1), pair, fitter, fit, fit.log_likelihood - base.log_likelihood)
+    monkeypatch.setattr(shapes, "_shaped", lambda *_: {})
+    (new,) = shapes_of((augmented, experiments, base, found))
+    assert dict(new.candidates[0].shape) == {"delay": 4, "before": 1}
+    assert new.candidates[1] == friction
+    assert new.cost == found.cost + PRICE
+    assert new.gain > found.gain + 1.0
+
+
 @pytest.mark.parametrize(("short", "moves"), [(1.5, False), (2.5, True)])
 def test_two_shapes_have_to_gain_two_nats(forced, short, moves):
     """A refit that is said to lie so many nats below its top."""
