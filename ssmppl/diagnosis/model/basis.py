@@ -45,6 +45,7 @@ TURNS = tuple(6.0 * 1.4**k for k in range(7))
 # Waves of a state in four of its standard deviations: finer than the curves follow, and so close
 # that of a wave between two of them these hold four fifths. Beyond, they are level.
 WAVES, EITHER_SIDE = (2, 3, 4, 5, 6), 2.0
+WHERE = " where "  # a curve of one variable, at a value of another
 
 
 @dataclass(frozen=True)
@@ -116,26 +117,32 @@ class BasisTerm:
     moment : "mean" or "scale". variable : what it is a function of, in words. function : of a
     single variable, with its centre and width; None of products and of what is past. factors : the
     variables, each with the number of its function in `CURVES`, from 1; none of what is past.
-    fine : whether it is of the Fourier series, which are looked at apart: they are many.
+    over : of the Fourier series, which are looked at apart, as they are many, the state, with where
+    the input is that it is multiplied by: one standard deviation above its mean.
     """
 
     candidate: Candidate
     equation: str
     moment: str
     variable: str
-    function: Smooth | None = None
+    function: Callable[..., Any] | None = None
     centre: float = 0.0
     width: float = 1.0
     factors: tuple[tuple[str, int], ...] = ()
-    fine: bool = False
+    over: str = ""
 
     @property
     def is_curve(self) -> bool:
-        """Whether it is a function of the present value of one variable."""
-        return self.function is not None
+        """Whether it is a smooth function of the present value of one variable."""
+        return self.function is not None and not self.fine
+
+    @property
+    def fine(self) -> bool:
+        """Whether it is of a Fourier series."""
+        return bool(self.over)
 
     def at(self, values: Any) -> Any:
-        """The function at values of the variable; of curves alone."""
+        """The function at values of the variable, or of the state that it is `over`."""
         assert self.function is not None
         return self.function((values - self.centre) / self.width)
 
@@ -249,27 +256,35 @@ def _fourier(part: Part, variables: Sequence[Part], scales: Scales) -> list[Basi
         x = scales.scale[state.label]
         for times in (None, *inputs):
             shape, bound = {"centre": x.mean, "width": x.sd}, {"z": state}
-            name = f"a Fourier series in {state.label}"
+            name, over = f"a Fourier series in {state.label}", state.label
             if times is not None:
                 y = scales.scale[times.label]
                 shape |= {"centre_w": y.mean, "width_w": y.sd}
                 bound, name = {**bound, "w": times}, f"{name} times {times.label}"
+                over = f"{over}{WHERE}{times.label} = {y.mean + y.sd:.3g}"
             for waves in WAVES:
                 for wave, of in ((np.cos, "cos"), (np.sin, "sin")):
+                    function = _wave(wave, waves)
                     found = _term(
                         part, "mean", name, f"{of} {waves} of {name}", "transition",
-                        _wave(wave, waves, times is not None), shape, bound,
+                        _along(function, times is not None), shape, bound,
                         f"{of} {waves} {part.label} {state.label} {times.label if times else ''}",
                     )  # fmt: skip
-                    out.append(replace(found, fine=True))
+                    out.append(replace(
+                        found, function=function, centre=x.mean, width=x.sd, over=over
+                    ))  # fmt: skip
     return out
 
 
-def _wave(wave: Callable[..., Any], waves: int, with_input: bool) -> Callable[..., Any]:
+def _wave(wave: Callable[..., Any], waves: int) -> Callable[..., Any]:
+    """Of a standardised variable."""
     angle = np.pi * waves / EITHER_SIDE
+    return lambda z: wave(angle * np.clip(z, -EITHER_SIDE, EITHER_SIDE))
 
+
+def _along(function: Callable[..., Any], with_input: bool) -> Callable[..., Any]:
     def alone(own, z, strength, centre, width):
-        return strength * wave(angle * np.clip((z - centre) / width, -EITHER_SIDE, EITHER_SIDE))
+        return strength * function((z - centre) / width)
 
     def times(own, z, w, strength, centre, width, centre_w, width_w):
         return alone(own, z, strength, centre, width) * (w - centre_w) / width_w

@@ -14,6 +14,7 @@ from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, 
 from ssmppl.diagnosis.experiment.design import Separation
 from ssmppl.diagnosis.experiment.recovery import Recovery
 from ssmppl.diagnosis.heldout.predictions import FreeRun
+from ssmppl.diagnosis.model.basis import WHERE
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.screening.location import BasisGroupScore, curve, localise, regions, when
 from ssmppl.diagnosis.screening.nearest_formula import nearest_formula
@@ -115,16 +116,22 @@ def _region(screen: Screen, places: list[int]) -> str:
 def missing_table(
     screen: Screen, key: tuple[str, str], others: Sequence[Candidate]
 ) -> pd.DataFrame:
-    """The estimated missing curve of the mean over each variable of an equation.
+    """The estimated missing curve of the mean over each variable of an equation; before them a
+    Fourier series, where that says more than any of them.
 
     others : candidates that are projected out.
     """
     terms, rows = screen.design.terms, []
-    places = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key and t.is_curve]
-    for variable in dict.fromkeys(terms[i].variable for i in places):
-        own = [i for i in places if terms[i].variable == variable]
-        group = screen.basis_group(own, others)
-        values = screen.design.grid(variable)
+    places: dict[tuple[bool, str], list[int]] = {}
+    for i, t in enumerate(terms):
+        if (t.equation, t.moment) == key and (t.is_curve or t.fine):
+            places.setdefault((t.fine, t.over or t.variable), []).append(i)
+    groups = {k: screen.basis_group(own, others) for k, own in places.items()}
+    best = max(groups, key=lambda k: groups[k].z, default=(False, ""))
+    shown = [k for k in groups if k == best or not (k[0] or (True, k[1]) == best)]
+    for fine, variable in sorted(shown, key=lambda k: not k[0]):
+        own, group = places[fine, variable], groups[fine, variable]
+        values = screen.design.grid(variable.partition(WHERE)[0])
         low_end, high_end = np.quantile(values, (0.02, 0.98))
         grid = np.linspace(float(low_end), float(high_end), CURVE_POINTS)
         design = np.stack([np.asarray(terms[i].at(grid)) for i in own], axis=1)

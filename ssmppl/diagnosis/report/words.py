@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ssmppl.diagnosis.experiment.design import ALIKE, OUTSIDE, SURE, Separation
 from ssmppl.diagnosis.heldout.simulation import WINDOWED
+from ssmppl.diagnosis.model.basis import WHERE
 from ssmppl.diagnosis.verdict.verdicts import CURVES, EFFECT, NO_GAP, NONE_OF_THESE
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
 
@@ -399,8 +400,10 @@ def _curve_peak(report: Findings) -> str:
     if not sure:
         return ""
     top = max(sure, key=lambda r: abs(r["estimate"]))
+    variable, _, where = str(top["variable"]).partition(WHERE)
     text = f"The estimated missing term in {top['equation']} is largest in magnitude at " \
-           f"{top['variable']} = {number(top['value'])}: {number(top['estimate'])}"  # fmt: skip
+           f"{variable} = {number(top['value'])}{where and f', {where}'}: " \
+           f"{number(top['estimate'])}"  # fmt: skip
     return f"{text} (95% band {number(top['low'])} to {number(top['high'])})."
 
 

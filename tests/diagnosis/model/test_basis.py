@@ -12,6 +12,7 @@ from ssmppl.diagnosis.model.basis import CURVES, REACH, TURNS, basis, symbolic_s
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report import tables
+from ssmppl.diagnosis.report.tables import CURVE_POINTS
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.verdict.decision import strongest_residual
@@ -183,7 +184,8 @@ def test_a_resonance_is_found_at_its_own_frequency(turn):
 @pytest.mark.parametrize("times", ["", " times u"])
 def test_a_ripple_over_a_state_is_found(frequency, times):
     """Of so many radians in a standard deviation of it: finer than the curves follow, and between
-    the waves that are tried. The table has one row for the place, with the finer of the two."""
+    the waves that are tried. The table has one row for the place, with the finer of the two, and
+    the curve goes up and down."""
     sd, size = 0.9, 0.4
 
     def missing(x, w, u):
@@ -198,6 +200,16 @@ def test_a_ripple_over_a_state_is_found(frequency, times):
     assert not table.duplicated(["equation", "moment"]).any()
     (row,) = table[(table["equation"] == "x") & (table["moment"] == "mean")].itertuples()
     assert row.region == f"with a Fourier series in x{times}"
+    missing = tables.missing_table(screen, ("x", "mean"), ())
+    over = missing["variable"].iloc[0]  # the ripple itself, in place of the smooth curve
+    assert over.startswith("x where u = " if times else "x")
+    assert set(missing["variable"]) == {over, "x", "u"}
+    curve = missing[missing["variable"] == over]
+    assert len(curve) == CURVE_POINTS
+    true = size * np.sin(frequency * curve["value"] / sd)
+    if times:
+        true = true * float(over.partition(" = ")[2])
+    assert np.corrcoef(curve["estimate"], true)[0, 1] > 0.5
 
 
 def test_waves_are_level_where_the_data_seldom_are(plain):
