@@ -404,7 +404,7 @@ def test_a_refit_begins_inside_of_the_bounds(seen):
     load = one(candidates, "constant load", "v")
     assert 0.0 < _inside(drag, -3.0) < 1e-9
     assert _inside(drag, 2.0) == 2.0
-    assert [_inside(delay, s) for s in (-1.0, 0.7, 9.0)] == pytest.approx([0.1, 0.7, 1.9])
+    assert [_inside(delay, s) for s in (-1.0, 0.7, 9.0)] == pytest.approx([0.0625, 0.7, 1.1875])
     assert _inside(load, -3.0) == -3.0
 
 

@@ -237,7 +237,7 @@ def test_the_report_asks_the_engine_that_the_effect_acts_through():
 
     own = ssm.simulator(**NAMES, forces={"f1": "v1", "f2": "v2"}, name="engine")(Engine())
     traced, (delay, *_) = offered(model_of(own), ["input delay"])
-    assert attribute_of(traced, delay, 0.7) == "input delay, u1, 0.7, ['delay']"
+    assert attribute_of(traced, delay, 0.7) == "input delay, u1, 0.7, ['before', 'delay']"
     traced, candidate = drag(model_of(own))
     assert attribute_of(traced, candidate, 0.7) == "quadratic drag, f2, 0.7, []"
     assert attribute_of(traced, candidate, 0.0) == ""
