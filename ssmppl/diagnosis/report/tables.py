@@ -27,7 +27,7 @@ from ssmppl.language.model.trace import Trace
 if TYPE_CHECKING:
     import pandas as pd
 
-CURVE_POINTS = 41
+CURVE_POINTS, WAVE_POINTS = 41, 161  # of curves, and of those that go up and down
 FIRST = 1  # number of the class of the best
 AT_BOUND = 1e-3  # standard errors of the screen, below which a one-sided strength is none
 STANDS_OUT = 3.0  # |z| of a region that is named
@@ -133,7 +133,8 @@ def missing_table(
         own, group = places[fine, variable], groups[fine, variable]
         values = screen.design.grid(variable.partition(WHERE)[0])
         low_end, high_end = np.quantile(values, (0.02, 0.98))
-        grid = np.linspace(float(low_end), float(high_end), CURVE_POINTS)
+        points = WAVE_POINTS if fine else CURVE_POINTS
+        grid = np.linspace(float(low_end), float(high_end), points)
         design = np.stack([np.asarray(terms[i].at(grid)) for i in own], axis=1)
         found = curve(group, design)
         for x, e, low, high in zip(grid, found.estimate, found.low, found.high, strict=True):

@@ -438,6 +438,11 @@ def how_far(report: Findings) -> list[str]:
     if not closed:
         return ["Not measured."]
     first, out = closed[0], []
+    r = windows(report)
+    same = r is not None and r["rmse_before"] == r["rmse_after"]
+    if report.verdict == NONE_OF_THESE and first["effect"] == CURVES and same:
+        return [f"Not measured: {CURVES}, fitted to the first rows, do not predict other rows "
+                "better than the model as it is."]  # fmt: skip
     told = simulated(report) if report.verdict != NO_GAP else ""
     if told:
         r = windows(report) or {}

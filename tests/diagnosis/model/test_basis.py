@@ -12,7 +12,7 @@ from ssmppl.diagnosis.model.basis import CURVES, REACH, TURNS, basis, symbolic_s
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report import tables
-from ssmppl.diagnosis.report.tables import CURVE_POINTS
+from ssmppl.diagnosis.report.tables import WAVE_POINTS
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.verdict.decision import strongest_residual
@@ -205,7 +205,7 @@ def test_a_ripple_over_a_state_is_found(frequency, times):
     assert over.startswith("x where u = " if times else "x")
     assert set(missing["variable"]) == {over, "x", "u"}
     curve = missing[missing["variable"] == over]
-    assert len(curve) == CURVE_POINTS
+    assert len(curve) == WAVE_POINTS
     true = size * np.sin(frequency * curve["value"] / sd)
     if times:
         true = true * float(over.partition(" = ")[2])

@@ -30,7 +30,7 @@ from ssmppl.diagnosis.report.words import (
     where,
     which,
 )
-from ssmppl.diagnosis.verdict.verdicts import VERDICTS
+from ssmppl.diagnosis.verdict.verdicts import CURVES, VERDICTS
 from ssmppl.drawing.numerals import DASH, interval, number, p_text, percent, span, with_error
 from ssmppl.errors import ArgumentError
 from tests.diagnosis.made_up import (
@@ -280,6 +280,27 @@ def test_the_curve_of_none_of_these_is_told_where_its_band_leaves_zero():
     flat = none_of_these()
     flat = dataclasses.replace(flat, missing=flat.missing.assign(low=-1.0, high=1.0))
     assert "largest" not in " ".join(which(flat))
+
+
+def test_a_ripple_is_told_with_where_the_input_is():
+    found = none_of_these()
+    over = found.missing["variable"] == "x"
+    found.missing.loc[over, "variable"] = "x where u = 2.37"
+    text = " ".join(which(found))
+    assert re.search(r"largest in magnitude at x = −?0\.5, u = 2\.37: −?0\.399 \(95% band", text)
+
+
+def test_curves_that_predict_no_other_rows_measure_nothing():
+    """The model as it is stands for them then: a reduction by 0% would be no finding."""
+    found = none_of_these()
+    assert "Not measured" not in " ".join(how_far(found))
+    closed = effect_found().closed.assign(effect=CURVES)
+    closed["rmse_after"] = closed["rmse_before"]
+    found = dataclasses.replace(found, closed=closed)
+    (text,) = how_far(found)
+    assert text.startswith("Not measured: smooth functions of states and inputs, fitted to the")
+    moved = found.closed.assign(rmse_after=0.9 * closed["rmse_before"])
+    assert "Not measured" not in how_far(dataclasses.replace(found, closed=moved))[0]
 
 
 def test_what_to_do_next():
