@@ -58,7 +58,7 @@ def significant_groups(
         if residual[key].p <= CHANCE and size > 1.0:
             variance = float(np.mean(found.variance[places]))
             tau = float(np.sqrt((size - 1.0) / variance))
-            out.append((size, [design.terms[i] for i in places], tau))
+            out.append((residual[key].z, [design.terms[i] for i in places], tau))
     out.sort(key=lambda g: -g[0])
     return [(terms, tau) for _, terms, tau in out[:GROUPS]]
 

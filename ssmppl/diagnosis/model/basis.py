@@ -43,8 +43,10 @@ RING = ("ring_1", "ring_2")  # a resonance: what is in step with it, and a quart
 # Rows to a turn: so close that with a ring that dies away within a turn none between two is missed.
 TURNS = tuple(6.0 * 1.4**k for k in range(7))
 # Waves of a state in four of its standard deviations: finer than the curves follow, and so close
-# that of a wave between two of them these hold four fifths. Beyond, they are level.
-WAVES, EITHER_SIDE = (2, 3, 4, 5, 6), 2.0
+# that of a wave between two of them these hold four fifths. Beyond, they are level. Apart by how
+# fine they are, as many functions see less than few; times inputs the first alone.
+SERIES = {"Fourier": range(2, 7), "fine Fourier": range(7, 13), "very fine Fourier": range(13, 25)}
+EITHER_SIDE = 2.0
 WHERE = " where "  # a curve of one variable, at a value of another
 
 
@@ -249,37 +251,57 @@ def _product(first: Smooth, second: Smooth) -> Callable[..., Any]:
 
 
 def _fourier(part: Part, variables: Sequence[Part], scales: Scales) -> list[BasisTerm]:
-    """Waves of each state, and these times each input; with many variables the waves alone."""
+    """Waves of each state, and the longer ones times each input; with many variables the waves
+    alone."""
     inputs = [v for v in variables if v.role == "input"] if len(variables) <= FEW else []
     out = []
     for state in (v for v in variables if v.role == "state"):
-        x = scales.scale[state.label]
-        for times in (None, *inputs):
-            shape, bound = {"centre": x.mean, "width": x.sd}, {"z": state}
-            name, over = f"a Fourier series in {state.label}", state.label
-            if times is not None:
-                y = scales.scale[times.label]
-                shape |= {"centre_w": y.mean, "width_w": y.sd}
-                bound, name = {**bound, "w": times}, f"{name} times {times.label}"
-                over = f"{over}{WHERE}{times.label} = {y.mean + y.sd:.3g}"
-            for waves in WAVES:
-                for wave, of in ((np.cos, "cos"), (np.sin, "sin")):
-                    function = _wave(wave, waves)
-                    found = _term(
-                        part, "mean", name, f"{of} {waves} of {name}", "transition",
-                        _along(function, times is not None), shape, bound,
-                        f"{of} {waves} {part.label} {state.label} {times.label if times else ''}",
-                    )  # fmt: skip
-                    out.append(replace(
-                        found, function=function, centre=x.mean, width=x.sd, over=over
-                    ))  # fmt: skip
+        for series, waves in SERIES.items():
+            for times in (None, *inputs) if series == "Fourier" else (None,):
+                out += _waves(part, state, times, series, waves, scales)
     return out
 
 
-def _wave(wave: Callable[..., Any], waves: int) -> Callable[..., Any]:
-    """Of a standardised variable."""
-    angle = np.pi * waves / EITHER_SIDE
-    return lambda z: wave(angle * np.clip(z, -EITHER_SIDE, EITHER_SIDE))
+def _waves(
+    part: Part, state: Part, times: Part | None, series: str, waves: range, scales: Scales
+) -> list[BasisTerm]:
+    """So many waves of a state, cosines and sines; all of them share what they are made of."""
+    x, over = scales.scale[state.label], state.label
+    name, shares = f"a {series} series in {over}", f"waves {part.label} {over}"
+    shape, bound = {"centre": x.mean, "width": x.sd}, {"z": state}
+    if times is not None:
+        y = scales.scale[times.label]
+        shape |= {"centre_w": y.mean, "width_w": y.sd}
+        bound, shares = {**bound, "w": times}, f"{shares} {times.label}"
+        name, over = (
+            f"{name} times {times.label}",
+            f"{over}{WHERE}{times.label} = {y.mean + y.sd:.3g}",
+        )
+    out = []
+    for number in waves:
+        for of in ("cos", "sin"):
+            function = _wave(number, of == "sin")
+            found = _term(
+                part, "mean", name, f"{of} {number} of {name}", "transition",
+                _along(function, times is not None), shape, bound, f"{of} {number} {shares}",
+                shares=shares,
+            )  # fmt: skip
+            out.append(replace(found, function=function, centre=x.mean, width=x.sd, over=over))
+    return out
+
+
+def _wave(number: int, sine: bool) -> Callable[..., Any]:
+    """Of a standardised variable; by the angles' addition, so that one cosine serves all."""
+
+    def function(z: Any) -> Any:
+        angle = np.pi / EITHER_SIDE * np.clip(z, -EITHER_SIDE, EITHER_SIDE)
+        c, s = np.cos(angle), np.sin(angle)
+        even, odd = c, s
+        for _ in range(number - 1):
+            even, odd = even * c - odd * s, odd * c + even * s
+        return odd if sine else even
+
+    return function
 
 
 def _along(function: Callable[..., Any], with_input: bool) -> Callable[..., Any]:

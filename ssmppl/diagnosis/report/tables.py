@@ -46,9 +46,10 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, B
     (`bonferroni`)."""
     observed, nuisance = screen.observed, screen.simulated.nuisance
     columns, terms = screen.simulated.basis, screen.design.terms
-    places: dict[tuple[str, str, bool], list[int]] = {}
+    places: dict[tuple[str, str, str], list[int]] = {}
     for i, t in enumerate(terms):
-        places.setdefault((t.equation, t.moment, t.fine), []).append(i)
+        series = t.variable if t.fine else ""
+        places.setdefault((t.equation, t.moment, series), []).append(i)
     if not places:
         return tabulate("where"), {}
     groups: dict[Hashable, Any] = {k: (columns[:, p], observed.basis[p]) for k, p in places.items()}
@@ -122,18 +123,19 @@ def missing_table(
     others : candidates that are projected out.
     """
     terms, rows = screen.design.terms, []
-    places: dict[tuple[bool, str], list[int]] = {}
+    places: dict[tuple[str, str], list[int]] = {}
     for i, t in enumerate(terms):
         if (t.equation, t.moment) == key and (t.is_curve or t.fine):
-            places.setdefault((t.fine, t.over or t.variable), []).append(i)
+            series = t.variable if t.fine else ""
+            places.setdefault((series, t.over or t.variable), []).append(i)
     groups = {k: screen.basis_group(own, others) for k, own in places.items()}
-    best = max(groups, key=lambda k: groups[k].z, default=(False, ""))
-    shown = [k for k in groups if k == best or not (k[0] or (True, k[1]) == best)]
-    for fine, variable in sorted(shown, key=lambda k: not k[0]):
-        own, group = places[fine, variable], groups[fine, variable]
+    best = max(groups, key=lambda k: groups[k].z, default=("", ""))
+    shown = [k for k in groups if k == best or not (k[0] or (best[0] and k[1] == best[1]))]
+    for series, variable in sorted(shown, key=lambda k: not k[0]):
+        own, group = places[series, variable], groups[series, variable]
         values = screen.design.grid(variable.partition(WHERE)[0])
         low_end, high_end = np.quantile(values, (0.02, 0.98))
-        points = WAVE_POINTS if fine else CURVE_POINTS
+        points = WAVE_POINTS if series else CURVE_POINTS
         grid = np.linspace(float(low_end), float(high_end), points)
         design = np.stack([np.asarray(terms[i].at(grid)) for i in own], axis=1)
         found = curve(group, design)

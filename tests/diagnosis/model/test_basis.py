@@ -88,6 +88,8 @@ def test_what_it_holds(plain):
     assert found == {
         ("x", "mean", "x"): 4, ("x", "mean", "u"): 4, ("x", "mean", "x and u"): 6,
         ("x", "mean", "a Fourier series in x"): 10,
+        ("x", "mean", "a fine Fourier series in x"): 12,
+        ("x", "mean", "a very fine Fourier series in x"): 24,
         ("x", "mean", "a Fourier series in x times u"): 10,
         ("x", "mean", "the past of x"): 3, ("x", "mean", "the past of u"): 3,
         **{("x", "mean", f"the ringing of {v} at {turn:.0f} rows"): 2
@@ -214,7 +216,7 @@ def test_a_ripple_over_a_state_is_found(frequency, times):
 
 def test_waves_are_level_where_the_data_seldom_are(plain):
     """Two standard deviations off a record tells nothing of the next ripple."""
-    (term,) = [t for t in plain.design.terms if t.candidate.strength == "sin_3_x_x"]
+    (term,) = [t for t in plain.design.terms if t.candidate.strength == "sin_3_waves_x_x"]
     function, shape = term.candidate.effect.function, {"centre": 1.0, "width": 0.5}
     inside = [float(function(0.0, z, 2.0, **shape)) for z in (1.1, 1.25)]
     assert inside == pytest.approx(2.0 * np.sin(3 * np.pi / 2 * np.array([0.2, 0.5])))
