@@ -86,7 +86,7 @@ def fit_reference(
             lambda: {"groups": _worth(augmented, chosen, start, groups, split, seed)},
         )
         groups = groups[: int(found["groups"])]
-    for count in dict.fromkeys((len(groups), min(1, len(groups)))):
+    for count in dict.fromkeys((len(groups), 1)) if groups else ():
         fitter, begin = superset(augmented, chosen, start, groups[:count])
 
         def numbers(fitter: Fitter = fitter, begin: Values = begin) -> Numbers:

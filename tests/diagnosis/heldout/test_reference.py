@@ -51,6 +51,19 @@ def test_groups_are_taken_in_as_long_as_each_predicts_other_rows_better(
     assert int(found) == expected
 
 
+def test_without_curves_it_is_the_model_itself_as_it_was_fitted(monkeypatch):
+    """And not a further fit of it, which would pass for one with curves."""
+    monkeypatch.setattr(reference, "significant_groups", lambda *_: [([], 1.0)])
+    monkeypatch.setattr(reference, "_worth", lambda *_: np.asarray(0))
+    chosen, start, own = ("drag",), object(), object()
+    augmented = SimpleNamespace(fitter=lambda c: own if c == chosen else None)
+    found = reference.fit_reference(
+        augmented, chosen, start, None, (), None, Checkpoint(None, {}), split=object()
+    )
+    assert found[0] is own
+    assert found[1] is start
+
+
 @pytest.mark.slow
 def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
     screen = asked(simulated(lambda x, w, u: 0.15 * x * u, "x and u"))
