@@ -85,7 +85,7 @@ def fit_reference(
             "reference on other rows",
             lambda: {"groups": _worth(augmented, chosen, start, groups, split, seed)},
         )
-        groups = groups[: int(found["groups"])]
+        groups = [g for g, kept in zip(groups, found["groups"], strict=True) if kept]
     for count in dict.fromkeys((len(groups), 1)) if groups else ():
         fitter, begin = superset(augmented, chosen, start, groups[:count])
 
@@ -105,20 +105,24 @@ def _worth(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
     groups: Sequence[tuple[list[BasisTerm], float]], split: RowSplit, seed: np.random.SeedSequence,
 ) -> np.ndarray:  # fmt: skip
-    """() how many groups, one after the other, predict the second part better than those before."""
-    best = -np.inf
-    for count in range(len(groups) + 1):
-        fitter, begin = superset(augmented, chosen, start, groups[:count])
+    """(G,) bool: the groups that, one after the other, predict the second part better than those
+    before; none where the model without them predicts nothing."""
+
+    def value(wanted: Sequence[tuple[list[BasisTerm], float]]) -> float:
+        fitter, begin = superset(augmented, chosen, start, wanted)
         try:
             fit = fitter.fit(split.reference_train, seed, begin, FROM_NEARBY)
             found = predict(fitter, fit, split.train, split.reference_validation, seed)
         except SSMError:
-            return np.asarray(max(count - 1, 0))
-        value = found.log_density.sum(axis=1).mean()
-        if not value > best:
-            return np.asarray(max(count - 1, 0))
-        best = value
-    return np.asarray(len(groups))
+            return -np.inf
+        return float(found.log_density.sum(axis=1).mean())
+
+    best, kept = value([]), np.zeros(len(groups), dtype=bool)
+    for k in range(len(groups) if np.isfinite(best) else 0):
+        kept[k] = True
+        new = value([g for g, taken in zip(groups, kept, strict=True) if taken])
+        kept[k], best = new > best, max(new, best)
+    return kept
 
 
 def superset(

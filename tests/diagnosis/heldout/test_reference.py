@@ -18,28 +18,31 @@ from tests.diagnosis.model.test_basis import THETA, asked, simulated
 FIXED = {n: np.asarray(v) for n, v in THETA.items() if n != "phi"}
 
 
+WITHOUT, FAILS = "", None
+
+
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ([1.0, 2.0, 3.0, 4.0], 3),
-        ([1.0, 2.0, 1.5, 9.0], 1),  # what comes after one that does not help is not looked at
-        ([1.0, 0.5, 3.0, 4.0], 0),
-        ([1.0, None, 3.0, 4.0], 0),  # no fit
-        ([None, 2.0, 3.0, 4.0], 0),
+        ({WITHOUT: 1.0, "a": 2.0, "ab": 3.0, "abc": 4.0}, "abc"),
+        ({WITHOUT: 1.0, "a": 0.5, "b": 2.0, "bc": 1.5}, "b"),
+        ({WITHOUT: 1.0, "a": FAILS, "b": 0.5, "c": 9.0}, "c"),
+        ({WITHOUT: 1.0, "a": 0.5, "b": 0.6, "c": 1.0}, ""),
+        ({WITHOUT: FAILS}, ""),
     ],
 )
-def test_groups_are_taken_in_as_long_as_each_predicts_other_rows_better(
-    monkeypatch, values, expected
-):
-    def fit(count):
-        if values[count] is None:
+def test_groups_are_taken_in_where_each_predicts_other_rows_better(monkeypatch, values, expected):
+    """One after the other, the first of them first; one that does not help bars no other."""
+
+    def fit(names):
+        if values[names] is FAILS:
             raise SamplingError("it has no fit", fix="none")
-        return values[count]
+        return values[names]
 
     monkeypatch.setattr(
         reference, "superset",
         lambda augmented, chosen, start, groups: (
-            SimpleNamespace(fit=lambda *_: fit(len(groups))), {}
+            SimpleNamespace(fit=lambda *_: fit("".join(terms for terms, _ in groups))), {}
         ),
     )  # fmt: skip
     monkeypatch.setattr(
@@ -47,14 +50,15 @@ def test_groups_are_taken_in_as_long_as_each_predicts_other_rows_better(
         lambda fitter, value, *_: SimpleNamespace(log_density=np.full((3, 2), value / 2)),
     )  # fmt: skip
     split = SimpleNamespace(reference_train=None, train=None, reference_validation=None)
-    found = reference._worth(None, (), None, [([], 1.0)] * 3, split, None)
-    assert int(found) == expected
+    groups = [(name, 1.0) for name in "abc"]
+    kept = reference._worth(None, (), None, groups, split, None)
+    assert "".join(name for name, k in zip("abc", kept, strict=True) if k) == expected
 
 
 def test_without_curves_it_is_the_model_itself_as_it_was_fitted(monkeypatch):
     """And not a further fit of it, which would pass for one with curves."""
     monkeypatch.setattr(reference, "significant_groups", lambda *_: [([], 1.0)])
-    monkeypatch.setattr(reference, "_worth", lambda *_: np.asarray(0))
+    monkeypatch.setattr(reference, "_worth", lambda *_: np.array([False]))
     chosen, start, own = ("drag",), object(), object()
     augmented = SimpleNamespace(fitter=lambda c: own if c == chosen else None)
     found = reference.fit_reference(
