@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.effect import Auxiliary, Effect, numbers
 from ssmppl.diagnosis.model.candidates import slug
@@ -166,7 +167,7 @@ def basis(trace: Trace, scales: Scales) -> list[BasisTerm]:
             out += [_curve(part, "mean", kind, v, k, scales) for v in read for k in range(MEAN)]
             if state:
                 out += _products(part, own, scales)
-                out += _fourier(part, own, scales)
+                out += _fourier(part, own, scales, bool(simulators(trace)))
                 moving = [v for v in own if v in noisy or v.role == "input"]
                 out += [_past(part, v, k, scales) for v in moving for k in range(len(PAST))]
                 driving = [v for v in moving if v is part or v.role == "input"]
@@ -250,13 +251,15 @@ def _product(first: Smooth, second: Smooth) -> Callable[..., Any]:
     return term
 
 
-def _fourier(part: Part, variables: Sequence[Part], scales: Scales) -> list[BasisTerm]:
+def _fourier(
+    part: Part, variables: Sequence[Part], scales: Scales, called: bool
+) -> list[BasisTerm]:
     """Waves of each state, and the longer ones times each input; with many variables the waves
-    alone."""
+    alone, and where a simulator is called the longer ones, as its functions are not compiled."""
     inputs = [v for v in variables if v.role == "input"] if len(variables) <= FEW else []
     out = []
     for state in (v for v in variables if v.role == "state"):
-        for series, waves in SERIES.items():
+        for series, waves in list(SERIES.items())[: 1 if called else None]:
             for times in (None, *inputs) if series == "Fourier" else (None,):
                 out += _waves(part, state, times, series, waves, scales)
     return out

@@ -18,6 +18,9 @@ from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.verdict.decision import strongest_residual
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence
+from ssmppl.language.tracing import trace
+from tests.diagnosis.harness import scales
+from tests.diagnosis.model.test_forces import model_of
 from tests.statistics.checks import seed_of
 
 STEPS = 120
@@ -99,6 +102,13 @@ def test_what_it_holds(plain):
     }  # fmt: skip
     assert all(t.is_curve == (t.variable in ("x", "u")) for t in terms)
     assert all(t.fine == ("Fourier" in t.variable) for t in terms)
+
+
+def test_a_simulator_has_the_longest_waves_alone():
+    """Its functions are not compiled, and each costs its time in every row."""
+    t = trace(model_of())
+    series = {term.variable.partition(" series")[0] for term in basis(t, scales(t, 50))}
+    assert {v for v in series if v.endswith("Fourier")} == {"a Fourier"}
 
 
 def test_what_is_past_shares_its_states_and_its_scale(plain):
