@@ -219,10 +219,12 @@ def test_memory_works_as_it_is_described():
     theta = models.THETA["simulator"]
     for c in items:
         shape = dict(c.shape)
-        acting, play, lag = u.copy(), u[0], u[0]
+        first = shape.get("before", 1.0) * u[0]
+        acting, play, lag = u.copy(), u[0], first
         for t in range(40):
             if c.effect.name == "input delay":
-                acting[t] = u[max(t - int(shape["delay"]), 0)]
+                delay = int(shape["delay"])
+                acting[t] = u[t - delay] if t >= delay else first
             elif c.effect.name == "actuator lag":
                 lag += (u[t] - lag) / shape["k"]
                 acting[t] = lag
