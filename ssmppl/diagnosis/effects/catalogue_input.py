@@ -55,7 +55,9 @@ def input_offset(u, strength):
 
 
 # -- with memory
-BEFORE = numbers(1, 0)  # of the first value: an input that was held before the record, or was off
+BEFORE = numbers(
+    1.0, 0.0
+)  # of the first value: an input that was held before the record, or was off
 
 
 @effect(on="input", kind="state", name="backlash", lower=0, upper=2, states=("held",),

@@ -137,12 +137,12 @@ class BasisTerm:
     @property
     def is_curve(self) -> bool:
         """Whether it is a smooth function of the present value of one variable."""
-        return self.function is not None and not self.fine
+        return self.function is not None and not self.series
 
     @property
-    def fine(self) -> bool:
-        """Whether it is of a Fourier series."""
-        return bool(self.over)
+    def series(self) -> str:
+        """The Fourier series that it is of; "" where it is of none."""
+        return self.variable if self.over else ""
 
     def at(self, values: Any) -> Any:
         """The function at values of the variable, or of the state that it is `over`."""

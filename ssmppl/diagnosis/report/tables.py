@@ -48,8 +48,7 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, B
     columns, terms = screen.simulated.basis, screen.design.terms
     places: dict[tuple[str, str, str], list[int]] = {}
     for i, t in enumerate(terms):
-        series = t.variable if t.fine else ""
-        places.setdefault((t.equation, t.moment, series), []).append(i)
+        places.setdefault((t.equation, t.moment, t.series), []).append(i)
     if not places:
         return tabulate("where"), {}
     groups: dict[Hashable, Any] = {k: (columns[:, p], observed.basis[p]) for k, p in places.items()}
@@ -125,9 +124,8 @@ def missing_table(
     terms, rows = screen.design.terms, []
     places: dict[tuple[str, str], list[int]] = {}
     for i, t in enumerate(terms):
-        if (t.equation, t.moment) == key and (t.is_curve or t.fine):
-            series = t.variable if t.fine else ""
-            places.setdefault((series, t.over or t.variable), []).append(i)
+        if (t.equation, t.moment) == key and (t.is_curve or t.series):
+            places.setdefault((t.series, t.over or t.variable), []).append(i)
     groups = {k: screen.basis_group(own, others) for k, own in places.items()}
     best = max(groups, key=lambda k: groups[k].z, default=("", ""))
     shown = [k for k in groups if k == best or not (k[0] or (best[0] and k[1] == best[1]))]

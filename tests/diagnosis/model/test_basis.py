@@ -101,7 +101,7 @@ def test_what_it_holds(plain):
         ("y", "mean", "x"): 4, ("y", "scale", "x"): 2,
     }  # fmt: skip
     assert all(t.is_curve == (t.variable in ("x", "u")) for t in terms)
-    assert all(t.fine == ("Fourier" in t.variable) for t in terms)
+    assert all(t.series == (t.variable if "Fourier" in t.variable else "") for t in terms)
 
 
 def test_a_simulator_has_the_longest_waves_alone():

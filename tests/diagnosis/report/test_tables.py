@@ -120,7 +120,7 @@ def test_the_p_of_where_counts_both_looks():
     basis[-1] += 2.0
     null = {"basis": basis[:-1], "nuisance": nuisance[:-1]}
     null |= {"basis_bins": np.zeros((100, 1, 6)), "nuisance_bins": np.zeros((100, 1, 2))}
-    terms = [SimpleNamespace(equation=e, moment=m, fine=False) for e, m in keys for _ in range(2)]
+    terms = [SimpleNamespace(equation=e, moment=m, series="") for e, m in keys for _ in range(2)]
     screen = SimpleNamespace(
         observed=SimpleNamespace(basis=basis[-1], nuisance=nuisance[-1]),
         simulated=SimpleNamespace(**null),

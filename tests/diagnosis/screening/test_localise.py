@@ -128,6 +128,21 @@ def test_groups_that_cannot_be_told_apart():
     assert all(g.kappa < 0.05 for g in groups.values())
 
 
+def test_two_groups_of_one_place_do_not_take_from_each_other():
+    """Curves and waves of one equation say much the same: each is looked at beside other places."""
+    rng = rng_of("one place")
+    s, n = rng.standard_normal((B + 1, 3)), rng.standard_normal((B + 1, P))
+    s[B] += 5.0
+    other = rng.standard_normal((B + 1, 3))
+    groups = {"curves": (s[:B], s[B]), "waves": (2 * s[:B], 2 * s[B]), "c": (other[:B], other[B])}
+    places = {"curves": "a", "waves": "a", "c": "c"}
+    table, found = localise(groups, n[:B], n[B], places)
+    assert (table["p"][:2] < 0.01).all()
+    without, _ = localise({k: groups[k] for k in ("curves", "c")}, n[:B], n[B])
+    assert table["z"][0] == pytest.approx(without["z"][0])
+    assert found["c"].kappa > 0.9
+
+
 def test_without_shrinkage_it_is_hotellings():
     """With many sets the statistic is S~' V^-1 S~ of the exact V."""
     rng = rng_of("hotelling")
