@@ -8,7 +8,8 @@ import pytest
 
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import FROM_START, Fitter
-from ssmppl.diagnosis.heldout import reference
+from ssmppl.diagnosis.heldout import gain_ratio, reference
+from ssmppl.diagnosis.heldout.reference import Residual
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.errors import SamplingError
@@ -53,6 +54,48 @@ def test_groups_are_taken_in_where_each_predicts_other_rows_better(monkeypatch, 
     groups = [(name, 1.0) for name in "abc"]
     kept = reference._worth(None, (), None, groups, split, None)
     assert "".join(name for name, k in zip("abc", kept, strict=True) if k) == expected
+
+
+def test_groups_come_by_how_far_they_stand_out(monkeypatch):
+    """Of few functions each may say more, and the group less."""
+    terms = [SimpleNamespace(equation="v", moment="mean", variable=v) for v in ("x", "u")]
+    nothing = SimpleNamespace(nuisance=np.zeros((5, 0)), basis=np.zeros((5, 2)))
+    seen = SimpleNamespace(nuisance=np.zeros(0), basis=np.zeros(2))
+    screen = SimpleNamespace(
+        design=SimpleNamespace(terms=terms), simulated=nothing, observed=seen,
+        columns_of=lambda _: (np.zeros((5, 0)), np.zeros(0)),
+    )  # fmt: skip
+    found = SimpleNamespace(status=["", ""], z=np.array([3.0, 5.0]), variance=np.ones(2))
+    groups = {("v", "mean", v): Residual(z, 0.01) for v, z in (("x", 9.0), ("u", 4.0))}
+    monkeypatch.setattr(reference.Null, "of", lambda *_: None)
+    monkeypatch.setattr(reference, "efficient", lambda *_: found)
+    monkeypatch.setattr(reference, "residual_groups", lambda *_: groups)
+    made = reference.significant_groups(screen, ())
+    assert [t[0].variable for t, _ in made] == ["x", "u"]
+
+
+@pytest.mark.parametrize("chosen", [True, False])
+@pytest.mark.parametrize("curves", [True, False])
+def test_it_is_told_whether_the_reference_has_curves(monkeypatch, chosen, curves):
+    def stop(*_, **__):
+        raise SamplingError("enough", fix="none")
+
+    base, effect, more = object(), object(), object()
+    own = SimpleNamespace(candidates=(), fit=effect, fitter=None, simulator=(None, effect))
+    plain = effect if chosen else base
+    monkeypatch.setattr(gain_ratio, "free_run", lambda *_: None)
+    monkeypatch.setattr(
+        gain_ratio, "fit_reference", lambda *_: (None, more if curves else plain)
+    )  # fmt: skip
+    monkeypatch.setattr(
+        gain_ratio, "predict", lambda *_: SimpleNamespace(log_density=None, starts=(0,))
+    )
+    monkeypatch.setattr(gain_ratio, "gain_ratio", stop)
+    split = SimpleNamespace(experiments=(), held_out=(), train=())
+    rows = gain_ratio.HeldOutRows(
+        None, split, (None, base), None, own if chosen else None, None, (None, base)
+    )
+    assert rows.gain("curves", None, None).curves == curves
 
 
 def test_without_curves_it_is_the_model_itself_as_it_was_fitted(monkeypatch):
