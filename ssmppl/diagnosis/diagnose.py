@@ -28,6 +28,7 @@ from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.cross_validation import FOLDS_CALLED, CrossValidation
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
 from ssmppl.diagnosis.heldout.predictions import Predictions, predict
+from ssmppl.diagnosis.heldout.reference import gain_of_curves
 from ssmppl.diagnosis.heldout.row_split import FOLDS, RowSplit, long_enough, three_parts
 from ssmppl.diagnosis.model.candidates import Chosen
 from ssmppl.diagnosis.model.candidates import chosen as chosen_effects
@@ -267,6 +268,11 @@ class _Diagnosis:
                 r.recovery = recovery(
                     self.augmented, [x for x in r.refits if len(x.index) == 1],
                     r.screen.experiments, self._seed(Stage.RECOVERY), self.checkpoint,
+                )  # fmt: skip
+            with self.failures.guard("what curves explain by themselves"):
+                r.curves_alone = gain_of_curves(
+                    self.augmented, r.fit, found.chosen.candidates, r.screen,
+                    r.screen.experiments, self._seed(Stage.CURVES), self.checkpoint,
                 )  # fmt: skip
         with self.failures.guard("the experiment that would separate the class best"):
             self._separating_experiment(r)

@@ -18,7 +18,14 @@ import numpy as np
 
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.experiment.rivals import NEEDED, Look, Rival, look_at, observed_range
+from ssmppl.diagnosis.experiment.rivals import (
+    NEEDED,
+    Look,
+    Rival,
+    look_at,
+    observed_range,
+    together,
+)
 from ssmppl.diagnosis.experiment.signals import Signal, family
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
@@ -184,7 +191,8 @@ class _Search:
         """The ratio with the recorded inputs; the least and the largest value (K,) of each channel
         that another experiment may lead to."""
         stage = "rivals under the recorded inputs"
-        (found,) = self._look(stage, [self.experiment], Look(self.effort.sets, True), 1)
+        look = Look(self.effort.sets, True, apart=True)
+        found = together(self._look(stage, [self.experiment], look, 1))
         low, high = observed_range(experiments)
         low, high = np.fmin(low, found.get("low", low)), np.fmax(high, found.get("high", high))
         room = ROOM * (high - low)
@@ -228,13 +236,16 @@ class _Search:
     def _look(
         self, stage: str, under: Sequence[Experiment], look: Look, place: int
     ) -> list[Numbers]:
-        """What came of each of the experiments; nothing where a fault ended it."""
+        """What came of each of the experiments, or of each truth in these where they are `apart`;
+        nothing where a fault ended it."""
         one = partial(
             look_at, self.augmented, self.rivals, under, look, child_seed(self.seed, place)
         )
-        failures = self.checkpoint.failures
+        failures, tasks = self.checkpoint.failures, len(under)
+        if look.apart:
+            tasks *= len(self.rivals)
         return [{} if failures.record_task(f"the {stage}", found) else found
-                for found in self.checkpoint.map(stage, len(under), one)]  # fmt: skip
+                for found in self.checkpoint.map(stage, tasks, one)]  # fmt: skip
 
     def _ratio(self, found: Numbers) -> float:
         """The mean ratio of the hardest pair; NaN where a pair has none in half of the sets."""

@@ -80,26 +80,33 @@ class Look:
     """How closely rivals are looked at. sets : simulated from each of them as the truth. fitted :
     whether the others are fitted to these; else they stay as they are, which bounds the ratio from
     above at hardly any cost. within : the least and the largest value (K,) of each channel, which
-    most of the sets may not leave; None: any."""
+    most of the sets may not leave; None: any. apart : whether each rival as the truth is a task of
+    its own, where there are few alternatives and fits take long."""
 
     sets: int
     fitted: bool
     within: tuple[np.ndarray, np.ndarray] | None = None
+    apart: bool = False
 
 
 def look_at(
     augmented: AugmentedModels, rivals: Sequence[Rival], alternatives: Sequence[Experiment],
     look: Look, seed: np.random.SeedSequence, k: int,
 ) -> Numbers:  # fmt: skip
-    """The rivals in data simulated with the inputs of the alternative k.
+    """The rivals in data simulated with the inputs of the alternative k; where truths are `apart`,
+    k counts these first, the rest is NaN, and `together` puts what came of one alternative's.
 
     "ratios" (S, R, R) : log-likelihood ratios in each set, of the truth in the row to the rival in
     the column; NaN where there is none. "low", "high" (K,) : of what was observed in all sets.
     "inside" : whether most of the sets are `within`; else there are no ratios.
     """
+    truths = list(range(len(rivals)))
+    if look.apart:
+        k, own_truth = divmod(k, len(rivals))
+        truths = [own_truth]
     e, models = alternatives[k], [_Model.of(r, r.fitter(augmented)) for r in rivals]
     drawn: dict[tuple[int, int], list[Experiment]] = {}
-    for i, truth in enumerate(models):
+    for i, truth in ((i, models[i]) for i in truths):
         for s in range(0 if rivals[i].happens_once else look.sets):
             with suppress(SSMError):  # the same random numbers under all alternatives
                 drawn[s, i] = truth.simulated(e, random_state(seed, s, i))
@@ -110,7 +117,7 @@ def look_at(
         if 2 * np.any(left, axis=1).sum() > len(left):
             return {"inside": np.array(False)}
     ratios = np.full((look.sets, len(models), len(models)), np.nan)
-    for i, truth in enumerate(models):
+    for i, truth in ((i, models[i]) for i in truths):
         for j, other in enumerate(models):
             start = other.z  # of the first set; of the next where the one before ended
             for s in range(look.sets if i != j else 0):
@@ -125,6 +132,17 @@ def look_at(
                     value = other.value(data)
                 ratios[s, i, j] = own - value
     return {"ratios": ratios, "inside": np.array(True), "low": low.min(axis=0),
+            "high": high.max(axis=0)}  # fmt: skip
+
+
+def together(found: Sequence[Numbers]) -> Numbers:
+    """What came of one alternative, from what came of each truth; nothing where one has none."""
+    if not all(found):
+        return {}
+    ratios = np.stack([f["ratios"] for f in found])
+    own = [ratios[i, :, i] for i in range(len(found))]  # (S, R) with each as the truth
+    low, high = (np.stack([f[n] for f in found]) for n in ("low", "high"))
+    return {"ratios": np.stack(own, axis=1), "inside": np.array(True), "low": low.min(axis=0),
             "high": high.max(axis=0)}  # fmt: skip
 
 
@@ -169,7 +187,8 @@ class _Model:
 
         Half a nat for each free number is taken off: by so much it is higher, on average, than at
         the same place in other data of this kind. least : a climb that does not come to its end, or
-        only so far, is tried another way.
+        only so far, is tried another way; of a simulator, which takes many points at once and whose
+        other way is ten times as long, where it does not come to its end.
         """
         problem = replace(self.fitter.problem, experiments=tuple(data))
         space = space_of(problem, self.fitter.fixed, self.values)
@@ -184,7 +203,8 @@ class _Model:
             if found is None:
                 return np.nan, self.z
             z, value = found.z, at(found.z)
-            if not found.ended or value < least:
+            called = isinstance(extended_model(self.fitter.problem.trace), Extended)
+            if not found.ended or (value < least and not called):
                 top = climb(density_of(space, likelihood), start)
                 if top is not None and at(top.z) > value:
                     z, value = top.z, at(top.z)

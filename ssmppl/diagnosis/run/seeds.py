@@ -21,6 +21,7 @@ class Stage(IntEnum):
     STATES = 11  # at the fit, for the scales
     TIMING = 12
     RECOVERY = 13  # of the leading effects from data simulated with each
+    CURVES = 14  # by themselves
 
 
 class Choice(IntEnum):

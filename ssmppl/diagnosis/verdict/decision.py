@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 SIGNIFICANT_GAIN_SE = 2.0  # standard errors of a gain beyond the catalogue that is no chance
 LEAST_SHARE_LEFT = 0.15  # of the gap, by the catalogue, before it is "none of these"
+FAR_MORE = 2.0  # times what the chosen effects gain, by curves in their place: "none of these"
 RESIDUAL_ALPHA_SHARE = 0.2  # of alpha, for what the catalogue leaves where nothing is held out
 
 Place = tuple[str, str]  # equation and moment
@@ -93,12 +94,15 @@ def _by_effects(r: Results, where: pd.DataFrame) -> Decision:
 
 
 def _open_mean(r: Results) -> Place | None:
-    """The mean that something is missing from though only laws of the noise were chosen: it stands
-    out beside them, and curves of it predict rows that they were not fitted to. Noise that grows
-    with what moves a state describes any missing term of that."""
-    if r.chosen is None or r.held_out is None or not r.held_out.curves:
+    """The mean that something is missing from which the chosen effects are not: it stands out
+    beside them, and either they are laws of the noise alone and curves predict rows that they were
+    not fitted to (noise that grows with what moves a state describes any missing term of that), or
+    curves in their place explain far more of the rows of the fit."""
+    if r.chosen is None:
         return None
-    if any(c.effect.cause != NOISE_LAW for c in r.chosen.candidates):
+    noise = all(c.effect.cause == NOISE_LAW for c in r.chosen.candidates)
+    described = noise and r.held_out is not None and r.held_out.curves
+    if not described and r.curves_alone < FAR_MORE * r.chosen.penalised_gain:
         return None
     residual, place = strongest_residual(r.screen, r.chosen.candidates)
     return place if residual <= r.alpha and place is not None and place[1] == "mean" else None

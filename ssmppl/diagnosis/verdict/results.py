@@ -28,7 +28,8 @@ class Results:
 
     blocks : left out in turn, 0 for three parts. recovery : of the leading effects in data that are
     simulated with each; None where there is none. separation : of the first class, None where it
-    was not looked for.
+    was not looked for. curves_alone : nats that curves gain in place of what was chosen, as of
+    `gain_of_curves`.
     """
 
     trace: Trace
@@ -46,6 +47,7 @@ class Results:
     blocks: int = 0
     recovery: Recovery | None = None
     separation: Separation | None = None
+    curves_alone: float = 0.0
     interrupted: bool = False
     failures: Failures = field(default_factory=Failures)
 

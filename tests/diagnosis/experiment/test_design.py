@@ -69,8 +69,11 @@ def looks(monkeypatch):
     taken = SimpleNamespace(all=[], answer=lambda e, look, n: {})
 
     def look_at(augmented, rivals, alternatives, look, seed, k):
-        e, n = alternatives[k], len(rivals)
-        taken.all.append((look.sets, look.fitted, e, tuple(seed.spawn_key), look.within))
+        n = len(rivals)
+        k, own = divmod(k, n) if look.apart else (k, 0)
+        e = alternatives[k]
+        if own == 0:  # a look at all truths, be they tasks of their own
+            taken.all.append((look.sets, look.fitted, e, tuple(seed.spawn_key), look.within))
         found = taken.answer(e, look, n)
         if isinstance(found, float):  # the same ratio for all pairs
             found = {"ratios": np.where(np.eye(n, dtype=bool), np.nan, np.full((n, n), found))}

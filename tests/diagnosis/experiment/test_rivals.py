@@ -22,6 +22,7 @@ from ssmppl.diagnosis.experiment.rivals import (
     increments,
     look_at,
     observed_range,
+    together,
 )
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, Fitter
@@ -181,6 +182,24 @@ def test_what_ran_to_a_bound_stays_there():
         fit=SimpleNamespace(by_parameter={"q": np.asarray(1e-8), "b": np.zeros(2)}),
     )  # fmt: skip
     assert Rival.of(refit).held == ("q",)
+
+
+def test_truths_apart_give_what_they_give_together():
+    """Each is a task: with the same data, of the same alternative."""
+    augmented, rivals = rivals_of("input saturation", "dead zone")
+    e = made()[2]
+    two = [e, replace(e, u=2.0 * e.u)]
+    for k in range(2):
+        whole = ratios_of(augmented, rivals, Look(2, True), alternatives=two, k=k)
+        apart = Look(2, True, apart=True)
+        each = [ratios_of(augmented, rivals, apart, alternatives=two, k=2 * k + i)
+                for i in range(2)]  # fmt: skip
+        assert np.isnan(each[0]["ratios"][:, 1]).all()
+        found = together(each)
+        assert found.keys() == whole.keys()
+        for name, value in whole.items():
+            np.testing.assert_array_equal(found[name], value)
+    assert together([each[0], {}]) == {}
 
 
 @pytest.mark.slow

@@ -141,3 +141,35 @@ def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
     fitter, found = made()
     assert fitter is base
     assert found is fit
+
+
+@pytest.mark.parametrize(
+    ("groups", "expected"),
+    [
+        ([("mean", 3), ("mean", 2)], 9.0 - 3.0),  # of the first group alone, one for each function
+        ([("scale", 3), ("mean", 2)], 0.0),
+        ([], 0.0),
+    ],
+)
+def test_curves_in_place_of_effects_gain_what_the_fit_does_less_their_number(
+    monkeypatch, groups, expected
+):
+    made = [([SimpleNamespace(moment=m)] * n, 1.0) for m, n in groups]
+    seen = []
+    monkeypatch.setattr(
+        reference, "significant_groups", lambda _, chosen: seen.append(chosen) or made
+    )
+
+    class Own:
+        fit = staticmethod(lambda *_: SimpleNamespace(numbers={"ll": np.asarray(-91.0)}))
+        restored = staticmethod(lambda _, n: SimpleNamespace(log_likelihood=float(n["ll"])))
+
+    def superset(augmented, chosen, start, groups):
+        assert (chosen, start, groups) == ((), base, made[:1])
+        return Own, {}
+
+    monkeypatch.setattr(reference, "superset", superset)
+    base = SimpleNamespace(log_likelihood=-100.0)
+    found = reference.gain_of_curves(None, base, ("drag",), None, (), None, Checkpoint(None, {}))
+    assert found == expected
+    assert seen == [("drag",)]  # what stands out beside it

@@ -14,6 +14,12 @@ NAN = float("nan")
 NOTHING = pd.DataFrame({"p": [0.5], "equation": ["v"], "moment": ["mean"]})
 
 
+def effects(*causes, gain=40.0):
+    """A chosen set with effects of these kinds."""
+    candidates = tuple(SimpleNamespace(effect=SimpleNamespace(cause=c)) for c in causes)
+    return SimpleNamespace(candidates=candidates, penalised_gain=gain)
+
+
 @pytest.mark.parametrize(
     ("first", "chosen", "blocks", "nats", "interval", "expected"),
     [
@@ -39,7 +45,7 @@ def test_where_the_share_is_open(monkeypatch, first, chosen, blocks, nats, inter
     ]
     r = SimpleNamespace(
         held_out=SimpleNamespace(rows=rows, curves=False), blocks=blocks, alpha=0.05,
-        screen_is_current=True, chosen=object() if chosen else None,
+        screen_is_current=True, chosen=effects(MECHANISM) if chosen else None, curves_alone=0.0,
     )  # fmt: skip
     assert decide(r, NOTHING, NOTHING).verdict == expected
     rows[0]["F"] = 0.8
@@ -74,16 +80,38 @@ MEAN, SCALE = ("v", "mean"), ("v", "scale")
 def test_a_law_of_the_noise_is_no_answer_while_a_mean_is_open(
     monkeypatch, causes, curves, p, place, expected
 ):
-    candidates = tuple(SimpleNamespace(effect=SimpleNamespace(cause=c)) for c in causes)
-    asked = []
+    chosen = effects(*causes) if causes else None
+    held_out = SimpleNamespace(rows=[], curves=curves)
+    _check(monkeypatch, chosen, held_out, 0.0, (p, place), expected)
+
+
+@pytest.mark.parametrize(
+    ("alone", "p", "place", "expected"),
+    [
+        (81.0, 0.01, MEAN, NONE_OF_THESE),  # more than twice the 40 nats of what was chosen
+        (79.0, 0.01, MEAN, EFFECT),
+        (81.0, 0.2, MEAN, EFFECT),  # nothing of it stands out beside what was chosen
+        (81.0, 0.01, SCALE, EFFECT),
+    ],
+)
+def test_curves_that_explain_far_more_by_themselves_are_no_effect_of_the_catalogue(
+    monkeypatch, alone, p, place, expected
+):
+    """Whatever they predict of other rows, at places where a machine has not been."""
+    for held_out in (SimpleNamespace(rows=[], curves=False), None):
+        chosen = effects(MECHANISM, MECHANISM, gain=40.0)
+        _check(monkeypatch, chosen, held_out, alone, (p, place), expected)
+
+
+def _check(monkeypatch, chosen, held_out, alone, residual, expected):
+    candidates, asked = chosen.candidates if chosen else (), []
     monkeypatch.setattr(decision, "_by_effects", lambda *_: Decision(EFFECT))
     monkeypatch.setattr(
-        decision, "strongest_residual", lambda _, others: asked.append(others) or (p, place)
+        decision, "strongest_residual", lambda _, others: asked.append(others) or residual
     )
     r = SimpleNamespace(
-        held_out=SimpleNamespace(rows=[], curves=curves), blocks=0, alpha=0.05, screen=None,
-        screen_is_current=True,
-        chosen=SimpleNamespace(candidates=candidates) if causes else None,
+        held_out=held_out, blocks=0, alpha=0.05, screen=None, screen_is_current=True,
+        chosen=chosen, curves_alone=alone,
     )  # fmt: skip
     found = decide(r, NOTHING, NOTHING)
     assert found.verdict == expected
