@@ -26,6 +26,7 @@ from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, proposal_
 from ssmppl.diagnosis.fitting.bounds import bounds_note
 from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.cross_validation import FOLDS_CALLED, CrossValidation
+from ssmppl.diagnosis.heldout.fewer_effects import drop_by_later_rows
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
 from ssmppl.diagnosis.heldout.predictions import Predictions, predict
 from ssmppl.diagnosis.heldout.reference import gain_of_curves
@@ -262,6 +263,10 @@ class _Diagnosis:
         if found.unfitted is not None:  # nothing to measure, then
             return
         with self.failures.guard("whether several effects predict better than fewer"):
+            if self.split:
+                drop_by_later_rows(
+                    found, self.split, self._seed(Stage.SELECTION), self.checkpoint
+                )  # fmt: skip
             self._validate_on_held_out_rows(r)
         if found.chosen is not None:
             with self.failures.guard("who is taken for whom"):

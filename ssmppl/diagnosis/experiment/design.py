@@ -191,8 +191,7 @@ class _Search:
         """The ratio with the recorded inputs; the least and the largest value (K,) of each channel
         that another experiment may lead to."""
         stage = "rivals under the recorded inputs"
-        look = Look(self.effort.sets, True, apart=True)
-        found = together(self._look(stage, [self.experiment], look, 1))
+        (found,) = self._look(stage, [self.experiment], Look(self.effort.sets, True), 1)
         low, high = observed_range(experiments)
         low, high = np.fmin(low, found.get("low", low)), np.fmax(high, found.get("high", high))
         room = ROOM * (high - low)
@@ -236,16 +235,15 @@ class _Search:
     def _look(
         self, stage: str, under: Sequence[Experiment], look: Look, place: int
     ) -> list[Numbers]:
-        """What came of each of the experiments, or of each truth in these where they are `apart`;
-        nothing where a fault ended it."""
+        """What came of each of the experiments; nothing where a fault ended it."""
+        look, rivals = replace(look, apart=len(under) == 1), len(self.rivals)
         one = partial(
             look_at, self.augmented, self.rivals, under, look, child_seed(self.seed, place)
         )
-        failures, tasks = self.checkpoint.failures, len(under)
-        if look.apart:
-            tasks *= len(self.rivals)
-        return [{} if failures.record_task(f"the {stage}", found) else found
-                for found in self.checkpoint.map(stage, tasks, one)]  # fmt: skip
+        failures, tasks = self.checkpoint.failures, len(under) * (rivals if look.apart else 1)
+        found = [{} if failures.record_task(f"the {stage}", f) else f
+                 for f in self.checkpoint.map(stage, tasks, one)]  # fmt: skip
+        return [together(found)] if look.apart else found
 
     def _ratio(self, found: Numbers) -> float:
         """The mean ratio of the hardest pair; NaN where a pair has none in half of the sets."""

@@ -81,7 +81,7 @@ class Look:
     whether the others are fitted to these; else they stay as they are, which bounds the ratio from
     above at hardly any cost. within : the least and the largest value (K,) of each channel, which
     most of the sets may not leave; None: any. apart : whether each rival as the truth is a task of
-    its own, where there are few alternatives and fits take long."""
+    its own, for one alternative that would keep a single process busy."""
 
     sets: int
     fitted: bool
@@ -94,11 +94,12 @@ def look_at(
     look: Look, seed: np.random.SeedSequence, k: int,
 ) -> Numbers:  # fmt: skip
     """The rivals in data simulated with the inputs of the alternative k; where truths are `apart`,
-    k counts these first, the rest is NaN, and `together` puts what came of one alternative's.
+    k counts these first, the rest is NaN, and `together` puts together what came of them.
 
     "ratios" (S, R, R) : log-likelihood ratios in each set, of the truth in the row to the rival in
     the column; NaN where there is none. "low", "high" (K,) : of what was observed in all sets.
-    "inside" : whether most of the sets are `within`; else there are no ratios.
+    "inside" : whether most of the sets are `within`; else there are no ratios. "left" : of each
+    set, whether it is not; of truths apart, which have ratios then too.
     """
     truths = list(range(len(rivals)))
     if look.apart:
@@ -112,10 +113,11 @@ def look_at(
                 drawn[s, i] = truth.simulated(e, random_state(seed, s, i))
     ends = [observed_range([e]), *(observed_range(data) for data in drawn.values())]
     low, high = (np.stack(part) for part in zip(*ends, strict=True))
+    left = np.zeros(len(low) - 1, dtype=bool)
     if look.within is not None:
-        left = (low[1:] < look.within[0]) | (high[1:] > look.within[1])
-        if 2 * np.any(left, axis=1).sum() > len(left):
-            return {"inside": np.array(False)}
+        left = np.any((low[1:] < look.within[0]) | (high[1:] > look.within[1]), axis=1)
+        if not look.apart and 2 * left.sum() > len(left):
+            return {"inside": np.array(False), "left": left}
     ratios = np.full((look.sets, len(models), len(models)), np.nan)
     for i, truth in ((i, models[i]) for i in truths):
         for j, other in enumerate(models):
@@ -132,18 +134,20 @@ def look_at(
                     value = other.value(data)
                 ratios[s, i, j] = own - value
     return {"ratios": ratios, "inside": np.array(True), "low": low.min(axis=0),
-            "high": high.max(axis=0)}  # fmt: skip
+            "high": high.max(axis=0), "left": left}  # fmt: skip
 
 
 def together(found: Sequence[Numbers]) -> Numbers:
     """What came of one alternative, from what came of each truth; nothing where one has none."""
     if not all(found):
         return {}
-    ratios = np.stack([f["ratios"] for f in found])
-    own = [ratios[i, :, i] for i in range(len(found))]  # (S, R) with each as the truth
+    left = np.concatenate([f["left"] for f in found])
+    if 2 * left.sum() > len(left):
+        return {"inside": np.array(False), "left": left}
+    own = [f["ratios"][:, i] for i, f in enumerate(found)]  # (S, R) with each as the truth
     low, high = (np.stack([f[n] for f in found]) for n in ("low", "high"))
     return {"ratios": np.stack(own, axis=1), "inside": np.array(True), "low": low.min(axis=0),
-            "high": high.max(axis=0)}  # fmt: skip
+            "high": high.max(axis=0), "left": left}  # fmt: skip
 
 
 def observed_range(experiments: Sequence[Experiment]) -> tuple[np.ndarray, np.ndarray]:

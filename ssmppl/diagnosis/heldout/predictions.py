@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.fitting.fit import Fit, Fitter
+from ssmppl.diagnosis.fitting.fit import FROM_NEARBY, Fit, Fitter
+from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.model.smoothing import Pass
 from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.inference.batched.extended import Extended
@@ -79,6 +80,20 @@ def predict(
     together = [p.covariance for p in passes[0] if p.covariance is not None]
     covariance = kept(together) if len(together) == len(counts) else None
     return Predictions(density, means.mean(axis=0), spread.mean(axis=0), y, starts, covariance)
+
+
+def predicted_later(
+    fitter: Fitter, start: Mapping[str, np.ndarray], split: RowSplit, seed: np.random.SeedSequence
+) -> float:  # fmt: skip
+    """Log predictive density of the rows of `train` that come later, fitted to the first ones.
+
+    Raises
+    ------
+    SSMError : it cannot be fitted, or predicts nothing.
+    """
+    fit = fitter.fit(split.reference_train, seed, dict(start), FROM_NEARBY)
+    found = predict(fitter, fit, split.train, split.reference_validation, seed)
+    return float(found.log_density.sum(axis=1).mean())
 
 
 def stretches(

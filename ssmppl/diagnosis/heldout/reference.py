@@ -16,7 +16,7 @@ from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, FROM_NEARBY, Fit, Fitter
-from ssmppl.diagnosis.heldout.predictions import predict
+from ssmppl.diagnosis.heldout.predictions import predicted_later
 from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.model.augment import augment, with_given_parameters
 from ssmppl.diagnosis.model.basis import BasisTerm, symbolic_shapes
@@ -112,11 +112,9 @@ def _worth(
     def value(wanted: Sequence[Group]) -> float:
         fitter, begin = superset(augmented, chosen, start, wanted)
         try:
-            fit = fitter.fit(split.reference_train, seed, begin, FROM_NEARBY)
-            found = predict(fitter, fit, split.train, split.reference_validation, seed)
+            return predicted_later(fitter, begin, split, seed)
         except SSMError:
             return -np.inf
-        return float(found.log_density.sum(axis=1).mean())
 
     best, kept = value([]), np.zeros(len(groups), dtype=bool)
     for k in range(len(groups) if np.isfinite(best) else 0):

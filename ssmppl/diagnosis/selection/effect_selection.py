@@ -24,6 +24,7 @@ from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
+from ssmppl.diagnosis.selection.equivalence import FORM
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.input_delays import promising_delays
 from ssmppl.diagnosis.selection.overlooked import (
@@ -343,7 +344,7 @@ class EffectSelection:
             ahead=best.ahead - single.ahead,
         )  # fmt: skip
         enough = further.penalised_gain >= worth and _simulates(further, best.candidates, worth)
-        return best if enough else None
+        return best if enough and further.score >= FORM * single.score else None
 
     def _forward(self, out: SelectionResult, most: int) -> None:
         """Screen again around the chosen model, and add what stands out, up to `most` effects."""
@@ -380,6 +381,14 @@ class EffectSelection:
             if not more:
                 return
             best = preferred(more, worth)[0]
+            if best.score < FORM * chosen.score:
+                out.notes.append(
+                    f"not named: {best.candidates[-1]}, which gains {best.penalised_gain:.1f} nats "
+                    f"beside {' and '.join(map(str, chosen.candidates))}; with simulations further "
+                    f"ahead that is less than {FORM:.0%} of what these gain, by which their "
+                    "formulas may be off"
+                )
+                return
             column = {c.key: k for k, c in enumerate(self.screen.design.candidates)}
             index = (*chosen.index, column[again.design.candidates[best.index[0]].key])
             out.chosen = chosen = Refit(

@@ -78,7 +78,8 @@ def looks(monkeypatch):
         if isinstance(found, float):  # the same ratio for all pairs
             found = {"ratios": np.where(np.eye(n, dtype=bool), np.nan, np.full((n, n), found))}
             found["ratios"] = np.repeat(found["ratios"][None], look.sets, axis=0)
-        ends = {"low": e.y.min(axis=0), "high": e.y.max(axis=0), "inside": np.array(True)}
+        ends = {"low": e.y.min(axis=0), "high": e.y.max(axis=0), "inside": np.array(True),
+                "left": np.zeros(1, dtype=bool)}  # fmt: skip
         return ends | found
 
     monkeypatch.setattr(design, "look_at", look_at)

@@ -200,6 +200,21 @@ def test_truths_apart_give_what_they_give_together():
         for name, value in whole.items():
             np.testing.assert_array_equal(found[name], value)
     assert together([each[0], {}]) == {}
+    outside = [f | {"left": np.array([True, False])} for f in each]
+    assert together(outside)["inside"]  # half of them
+    outside[0]["left"] = np.array([True, True])
+    assert not together(outside)["inside"]
+
+
+def test_sets_that_leave_the_range_are_told():
+    augmented, rivals = rivals_of("input saturation", "dead zone")
+    narrow = Look(2, False, (np.array([-1e-3]), np.array([1e-3])))
+    assert not ratios_of(augmented, rivals, narrow)["inside"]
+    each = [ratios_of(augmented, rivals, replace(narrow, apart=True), k=i) for i in range(2)]
+    assert all(f["left"].all() for f in each)
+    assert not together(each)["inside"]
+    wide = replace(narrow, within=(np.array([-1e3]), np.array([1e3])))
+    assert not ratios_of(augmented, rivals, wide)["left"].any()
 
 
 @pytest.mark.slow

@@ -42,17 +42,11 @@ def test_groups_are_taken_in_where_each_predicts_other_rows_better(monkeypatch, 
 
     monkeypatch.setattr(
         reference, "superset",
-        lambda augmented, chosen, start, groups: (
-            SimpleNamespace(fit=lambda *_: fit("".join(terms for terms, _ in groups))), {}
-        ),
+        lambda augmented, chosen, start, groups: ("".join(terms for terms, _ in groups), {}),
     )  # fmt: skip
-    monkeypatch.setattr(
-        reference, "predict",
-        lambda fitter, value, *_: SimpleNamespace(log_density=np.full((3, 2), value / 2)),
-    )  # fmt: skip
-    split = SimpleNamespace(reference_train=None, train=None, reference_validation=None)
+    monkeypatch.setattr(reference, "predicted_later", lambda names, *_: fit(names))
     groups = [(name, 1.0) for name in "abc"]
-    kept = reference._worth(None, (), None, groups, split, None)
+    kept = reference._worth(None, (), None, groups, object(), None)
     assert "".join(name for name, k in zip("abc", kept, strict=True) if k) == expected
 
 
