@@ -1,11 +1,14 @@
 """`diagnose` on a simulator that is a function of NumPy: what it lacks acts through its force."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import Fitter
+from ssmppl.diagnosis.model import smoothing
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import score_columns
@@ -131,6 +134,31 @@ def test_predictions_of_a_linear_simulator_are_those_of_the_exact_filter():
     # of the sample variance of 64 normal draws, whose sd is sqrt(2 / 64) of it
     assert np.all(np.abs(variance / v - 1.0) < 4.5 * np.sqrt(2.0 / 64))
     assert np.all(np.abs(below - p) < 0.1)
+
+
+def test_rows_ask_the_simulator_together(monkeypatch):
+    """Scores of its parameters are those of calls row by row, in a fraction of the calls."""
+    calls = []
+
+    @ssm.simulator(state=["x", "v"], parameters=["a"])
+    def called(state, inputs, parameters):
+        calls.append(len(state))
+        x, v = state.T
+        return np.stack([x + np.sin(v), parameters[:, 0] * v], axis=1)
+
+    def step(x, v, a):
+        new = called([x, v], [], [a])
+        return new.x, new.v
+
+    y, found = np.cumsum(np.random.default_rng(4).normal(size=80)), []
+    for context in (smoothing.gathered, nullcontext):
+        monkeypatch.setattr(smoothing, "gathered", context)
+        before = len(calls)
+        found.append((passed(trend(step), y).rows, len(calls) - before))
+    (together, few), (apart, many) = found
+    assert np.abs(together).max() > 1.0
+    np.testing.assert_array_equal(together, apart)
+    assert few < many - 80
 
 
 def test_a_sensor_that_jumps_is_not_tried():

@@ -35,7 +35,7 @@ from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.expressions.batched.call import OP, thriftily
+from ssmppl.expressions.batched.call import OP, gathered, thriftily
 from ssmppl.expressions.expr import Expr, topological
 from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
@@ -178,9 +178,18 @@ class Smoother:
                 self.module.row_predictions(given, *data, *known, stream, prediction)
         particles = np.zeros((e.steps, len(self.columns.carried.state_symbols), found.shape[2]))
         particles[:, : found.shape[1]] = found
-        if self.columns.follows:
-            self.module.complete_rows(given, *data, particles, ancestors)
-        self.module.row_scores(given, *data, particles, weights, ancestors, self.settings.lag, rows)
+
+        def derive() -> None:
+            if self.columns.follows:
+                self.module.complete_rows(given, *data, particles, ancestors)
+            self.module.row_scores(
+                given, *data, particles, weights, ancestors, self.settings.lag, rows
+            )
+
+        if isinstance(self.extended, Extended):
+            with gathered():  # a simulator moves the states of all rows at once
+                derive()
+        derive()
         scores = None
         if ahead and known is not None:
             feedback = feeds_back(self.columns.base)

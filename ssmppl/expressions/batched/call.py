@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
 
+from ssmppl.errors import SSMError
 from ssmppl.expressions.batched.differences import HIGHEST, Index, Stencil
 from ssmppl.expressions.node import Expr
 
 OP = "simulator"
 MOST_KEPT = 64  # points of a call beyond which no values are kept: many seldom come again
+MOST_AT_ONCE = 512  # points of a call for what was gathered
 _here = threading.local()
+Asked = tuple[Any, tuple[Index, ...], np.ndarray]  # the arguments of `computed`
 
 
 class Batched(Protocol):
@@ -105,6 +108,10 @@ def computed(function: Any, wanted: tuple[Index, ...], x: np.ndarray) -> np.ndar
     """(len(wanted), outputs, B) at x (B, K)."""
     kept: dict[Any, dict[Any, np.ndarray]] | None = getattr(_here, "kept", None)
     if kept is not None and _here.alike and 1 < len(x) <= MOST_KEPT:
+        asked: list[Asked] | None = getattr(_here, "asked", None)
+        if asked is not None:
+            asked.append((function, wanted, np.array(x)))
+            return np.zeros((len(wanted), function.outputs, len(x)))
         found = _at_centre(function, wanted, x, kept)
         if np.isfinite(found).all():
             return found
@@ -134,6 +141,59 @@ def _at_centre(
     for w, index in enumerate(wanted):
         out[w] = known[index]
     return out
+
+
+@contextmanager
+def gathered() -> Iterator[None]:
+    """Within it, inside of `thriftily(alike=True)`, calls are taken down, and come to zeros; at its
+    end they are computed together, in few calls, and kept. For what asks for points that do not
+    depend on what it is given, row by row: it is run twice, and the second time all is there.
+
+    What raises in a large call is left to the small one, which tells of it.
+    """
+    asked: list[Asked] = []
+    _here.asked = asked
+    try:
+        yield
+    finally:
+        _here.asked = None
+    kept: dict[Any, dict[Any, np.ndarray]] | None = getattr(_here, "kept", None)
+    if kept is not None:
+        with suppress(SSMError):
+            _compute(asked, kept)
+
+
+def _compute(asked: Sequence[Asked], kept: dict[Any, dict[Any, np.ndarray]]) -> None:
+    """What `_at_centre` would keep of each call; not of those that come to no number."""
+    every: dict[Any, tuple[Any, dict[Index, None], np.ndarray]] = {}
+    for function, wanted, x in asked:
+        key = function.name, x.tobytes(), "centre"
+        every.setdefault(key, (function, {}, x))[1].update(dict.fromkeys(wanted))
+    alike: dict[Any, list[Any]] = {}
+    for key, (function, indices, x) in every.items():
+        slopes = tuple(sorted((i for i in indices if i), key=lambda i: (len(i), i)))
+        alike.setdefault((function.name, slopes, () in indices, x.shape), []).append(key)
+    for (_, slopes, values, shape), keys in alike.items():
+        function, points = every[keys[0]][0], np.stack([every[k][2] for k in keys])
+        if slopes:
+            stencil = stencil_of(slopes, shape[1], True)
+            for some in _parts(len(keys), len(stencil.shifts)):
+                means = points[some].mean(axis=1)
+                found = stencil.derivatives(function.at, means, function.scales)
+                for k, own in zip(keys[some], np.moveaxis(found, 2, 0), strict=True):
+                    if np.isfinite(own).all():
+                        kept.setdefault(k, {}).update(zip(slopes, own[:, :, None], strict=True))
+        for some in _parts(len(keys), shape[0]) if values else ():
+            found = function.at(points[some].reshape(-1, shape[1]))
+            for k, own in zip(keys[some], found.reshape(-1, shape[0], found.shape[1]), strict=True):
+                kept.setdefault(k, {})[()] = own.T
+
+
+def _parts(count: int, points: int) -> Iterator[slice]:
+    """Slices of so many calls, each of so many points, for a call of `MOST_AT_ONCE` at most."""
+    size = max(1, MOST_AT_ONCE // points)
+    for first in range(0, count, size):
+        yield slice(first, first + size)
 
 
 @contextmanager

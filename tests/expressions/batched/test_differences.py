@@ -5,7 +5,8 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from ssmppl.expressions.batched.call import computed, thriftily
+from ssmppl.errors import SamplingError
+from ssmppl.expressions.batched.call import MOST_AT_ONCE, computed, gathered, thriftily
 from ssmppl.expressions.batched.differences import FIRST, ONE_SIDED, SECOND, Stencil
 
 X = np.array([[0.3, -1.2], [2.0, 0.0], [-0.7, 40.0]])
@@ -186,3 +187,56 @@ def test_within_another_thrifty_part_the_outer_one_goes_on():
             np.testing.assert_allclose(slope[0], 3.0 * x[:, 0] ** 2, rtol=1e-6)
         slope = computed(function, ((0,),), x)[0]
         np.testing.assert_allclose(slope[0], 3.0, rtol=1e-6)
+
+
+def passed(function, points):
+    """What a pass over rows asks for: values and derivatives of one, then others at the same."""
+    found = []
+    for wanted in (((), (0,)), ((), (0, 0), (0,)), ((0,),)):
+        found += [computed(function, wanted, x) for x in points]
+    return found
+
+
+def test_calls_that_are_gathered_are_made_together_and_give_the_same():
+    points = [np.linspace(a, a + 0.3, 4)[:, None] for a in np.linspace(0.5, 3.0, 200)]
+    plain, function = Cubed(), Cubed()
+    with thriftily(alike=True):
+        expected = passed(plain, points)
+    with thriftily(alike=True):
+        with gathered():
+            blank = passed(function, points)
+        assert not any(b.any() for b in blank)
+        assert [b.shape for b in blank] == [e.shape for e in expected]
+        before = len(function.asked)
+        found = passed(function, points)
+        assert len(function.asked) == before  # all was there
+    assert before < 10 < len(plain.asked)
+    assert max(function.asked) <= MOST_AT_ONCE
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-4)  # first ones beside second ones: other steps
+    with thriftily(alike=True):  # and of derivatives that are asked for alike, the very same
+        expected = [computed(plain, ((), (0,)), x) for x in points]
+    with thriftily(alike=True):
+        with gathered():
+            [computed(function, ((), (0,)), x) for x in points]
+        found = [computed(function, ((), (0,)), x) for x in points]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_what_comes_to_no_number_or_raises_together_is_asked_for_alone():
+    class Gap(Cubed):
+        def at(self, points):
+            super().at(points)
+            if len(points) > 20:
+                raise SamplingError("too many", fix="fewer")
+            return np.where(np.abs(points) < 0.5, np.nan, points**3)
+
+    few = [np.array([[-1.0], [1.1]]), np.array([[0.9], [1.1]])]
+    for points in (few, [np.array([[a], [a + 0.1]]) for a in np.linspace(1.0, 2.0, 30)]):
+        with thriftily(alike=True):
+            with gathered():
+                [computed(Gap(), ((0,),), x) for x in points]
+            found = [computed(Gap(), ((0,),), x)[0] for x in points]
+        for x, slope in zip(points, found, strict=True):
+            middle = x if abs(x.mean()) < 0.5 else np.full_like(x, x.mean())
+            np.testing.assert_allclose(slope[0], 3.0 * middle[:, 0] ** 2, rtol=1e-6)
