@@ -648,7 +648,9 @@ class Fitter:
 
     def with_information(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
         """The fit with an information matrix worth its name: minus the second derivatives where
-        they are exact, else that of scores simulated at it; its own was built up on the way. NaN
+        they are exact, else that of scores simulated at it; its own was built up on the way. Of a
+        simulator the second derivatives by differences where they are those of a top: where a mean
+        bends sharply they see the bends, and its own, by the filter's predictions, does not. NaN
         where nothing that is simulated can be filtered."""
         free = np.ix_(~fit.at_bound, ~fit.at_bound)  # at a bound it says nothing
         if isinstance(self.kalman, KalmanModel):
@@ -662,8 +664,10 @@ class Fitter:
         if many is not None:
             found = np.full_like(fit.information, np.nan)
             found[free] = self._curvature(fit, many)
-            if np.all(np.isfinite(found[free])):
-                return replace(fit, information=found)
+            for information in (found, fit.information):
+                inside = information[free]
+                if np.all(np.isfinite(inside)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
+                    return replace(fit, information=information)
         try:
             found = self._simulated_information(fit.space, fit.theta, seed)
         except SamplingError:  # then there are no standard errors

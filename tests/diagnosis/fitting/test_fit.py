@@ -1,11 +1,13 @@
 """Fits: exact modes, and particle fits of the same models, in nats from the exact one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.diagnosis.fitting.fit import FROM_START, Effort, Fitter
+from ssmppl.diagnosis.fitting.fit import FROM_START, Effort, Fit, Fitter
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import kalman_model
@@ -181,3 +183,26 @@ def test_a_step_over_a_cliff_is_taken_back(monkeypatch, after):
     assert len(calls) > after
     assert np.max(np.abs(found.z - calls[0])) < 2.0
     assert found.log_likelihood > -200.0
+
+
+@pytest.mark.parametrize(
+    ("curvature", "own", "expected"),
+    [
+        (np.diag([4.0, 2.0]), np.diag([3.0, 1.0]), np.diag([4.0, 2.0])),
+        (np.diag([4.0, -2.0]), np.diag([3.0, 1.0]), np.diag([3.0, 1.0])),  # no top to see
+        (np.diag([4.0, np.nan]), np.diag([3.0, 1.0]), np.diag([3.0, 1.0])),
+        (np.diag([4.0, -2.0]), np.diag([3.0, -1.0]), np.eye(2)),  # neither: by simulation
+    ],
+)
+def test_of_a_simulator_what_has_no_top_is_no_information(monkeypatch, curvature, own, expected):
+    """A mean that bends sharply has second differences of any sign."""
+    monkeypatch.setattr(Fitter, "_extended_of_many", lambda *_: "calls")
+    monkeypatch.setattr(Fitter, "_curvature", lambda *_: curvature)
+    monkeypatch.setattr(Fitter, "_simulated_information", lambda *_: np.eye(2))
+    fitter = object.__new__(Fitter)
+    fitter.kalman = NotApplicable("it calls a simulator")
+    some = dict.fromkeys(Fit.__dataclass_fields__)
+    space = SimpleNamespace(problem=None)
+    fit = Fit(**some | {"space": space, "information": own, "at_bound": np.zeros(2, dtype=bool)})
+    found = fitter.with_information(fit, None)
+    np.testing.assert_array_equal(found.information, expected)
