@@ -59,6 +59,7 @@ PROMISING = 0.25  # of the best refit's score, by moving an input alone: then it
 MOST_LOST = 1.0  # nats, further ahead, by what only describes a misfit
 FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
 AGAIN_CALLED = 60  # likewise, of a model that calls a simulator
+PROMISED = 0.25  # of what a further effect has to gain, by its score: else it is not refitted
 FIRST_LOOK, NOTHING = 30, 0.5  # of these sets first; a family-wise p of so much by them is no gap
 
 
@@ -366,8 +367,12 @@ class EffectSelection:
                 return
             if float(np.min(again.family.p, initial=1.0)) > CLOSER_LOOK_FACTOR * self.alpha:
                 return
+            least = PROMISED * FORM * chosen.score
+            found = [k for k in leading(again)[:FOLLOWERS] if again.efficient.gain[k] >= least]
+            if not found:
+                return
             more, failed = self._refit(
-                out, chosen.fit, again, [[k] for k in leading(again)[:FOLLOWERS]],
+                out, chosen.fit, again, [[k] for k in found],
                 child_seed(seed, Task.FURTHER_REFITS + number), "refitting", chosen.candidates,
                 checkpoint=self.checkpoint.within(f"with {number + 1} effects"),
             )  # fmt: skip
