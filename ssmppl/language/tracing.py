@@ -64,8 +64,21 @@ def trace(model: Model) -> Trace:
         with LOCK:
             cached = _traces.get(model)
             if cached is None or cached[0] != signature:
-                _traces[model] = cached = (signature, _Tracer(model).run())
+                trace = _traced(model)
+                _traces[model] = cached = (model.signature, trace)
     return cached[1]
+
+
+class _Redefined(Exception):
+    """A function turned out to be one of before, declared again: the model has changed."""
+
+
+def _traced(model: Model) -> Trace:
+    while True:
+        try:
+            return _Tracer(model).run()
+        except _Redefined:
+            continue
 
 
 class _Tracer:
@@ -121,7 +134,8 @@ class _Tracer:
 
     def _sites(self, function_role: str, role: str) -> dict[str, Site]:
         sites: dict[str, Site] = {}
-        for function in self.model.functions[function_role]:
+        givers: dict[str, Callable[..., Any]] = {}
+        for function in list(self.model.functions[function_role]):
             where = location_of(function)
             returned = self._call(function, function_role, where)
             line = return_location(function)
@@ -141,6 +155,8 @@ class _Tracer:
                 if function_role in ("initial", "transition"):
                     find_root(distribution)
                 if name in sites:
+                    if self.model.forgets(function_role, givers[name], function):
+                        raise _Redefined
                     raise ModelError(
                         f"{name!r} is given by two @{function_role} functions; the other is at "
                         f"{sites[name].where}",
@@ -155,6 +171,7 @@ class _Tracer:
                         self.symmetric.add(name)
                 value = symbols(role, name, distribution.shape, name in self.symmetric)
                 sites[name] = Site(name, role, distribution, value, where)
+                givers[name] = function
             if function_role == "transition":
                 for name in laws:
                     self.new.give(sites[name])

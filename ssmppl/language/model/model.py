@@ -10,6 +10,7 @@ import difflib
 import inspect
 import linecache
 import textwrap
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
@@ -18,7 +19,8 @@ import numpy as np
 from ssmppl import markup
 from ssmppl.errors import Location, ModelError, UnknownName
 from ssmppl.expressions.expr import user_location
-from ssmppl.language.model.closure_digest import digest_of_code, plain_function
+from ssmppl.language.model.closure_digest import digest_of_code, fingerprint, plain_function
+from ssmppl.language.model.executions import Execution, this_execution
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
 TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}  # in seconds
@@ -120,6 +122,8 @@ class Model:
             key: () if length is None else (int(length),) for key, length in pairs
         }
         self.functions: dict[str, list[Callable[..., Any]]] = {role: [] for role in ROLES}
+        self._executions: dict[Callable[..., Any], Execution] = {}  # in which each was declared
+        self._outdated: dict[tuple[str, str], Callable[..., Any]] = {}  # by role and name
 
     def _checked_time_step(self, name: str | None, unit: str) -> tuple[str, str] | None:
         if name is not None and not (isinstance(name, str) and name.isidentifier()):
@@ -225,6 +229,9 @@ class Model:
             )
         raise UnknownName(f"a model has no {name!r}", fix=fix, where=user_location())
 
+    def __getstate__(self) -> dict[str, Any]:  # no other process runs this one's cells again
+        return self.__dict__ | {"_executions": {}, "_outdated": {}}
+
     def _declare(self, role: str, function: Law) -> Law:
         if not (inspect.isfunction(function) or inspect.ismethod(function)):
             found = (
@@ -237,16 +244,57 @@ class Model:
                 fix=f"write @model.{role} (without parentheses) on the line above a def",
                 where=user_location(),
             )
+        now = this_execution()
+        self._forget(lambda role, old, then: now.outdates(then))
         if role in ("initial", "proposal") and self.functions[role]:
-            first = location_of(self.functions[role][0])
-            raise ModelError(
-                f"a second @{role} function; the first is at {first}",
-                fix=f"return all states from one @{role} function; in a notebook, run the cell of "
-                "ssm.Model(...) again before its functions",
-                where=location_of(function),
-            )
+            first = self.functions[role][0]
+            if not self.forgets(role, first, function, now):
+                raise ModelError(
+                    f"a second @{role} function; the first is at {location_of(first)}",
+                    fix=f"return all states from one @{role} function; in a notebook, run the cell "
+                    "of ssm.Model(...) again before its functions",
+                    where=location_of(function),
+                )
         self.functions[role].append(function)
+        self._executions[function] = now
+        self._note_change(role, function)
         return function
+
+    def forgets(
+        self, role: str, old: Callable[..., Any], new: Callable[..., Any],
+        now: Execution | None = None,
+    ) -> bool:  # fmt: skip
+        """Drop a function that gives what another one gives, where that is the same function,
+        declared again: whether it was."""
+        now = now or self._executions.get(new)
+        then = self._executions.get(old)
+        if now is None or then is None or not now.redefines(new, old, then):
+            return False
+        self._forget(lambda r, f, _: r == role and f is old)
+        self._note_change(role, new)
+        return True
+
+    def _forget(self, outdated: Callable[[str, Callable[..., Any], Execution], bool]) -> None:
+        """Drop the functions for which this holds, of their role, themselves and their run."""
+        for role, functions in self.functions.items():
+            for old in list(functions):
+                if old in self._executions and outdated(role, old, self._executions[old]):
+                    functions.remove(old)
+                    del self._executions[old]
+                    self._outdated[role, old.__qualname__] = old
+
+    def _note_change(self, role: str, function: Callable[..., Any]) -> None:
+        """Say that a function which is declared again is another one now."""
+        old = self._outdated.pop((role, function.__qualname__), None)
+        if old is not None and fingerprint(old) != fingerprint(function):
+            where = location_of(function)
+            warnings.warn_explicit(
+                f"@{role} {function.__name__} of model {self.name!r} has changed, and takes the "
+                "place of the one that was declared here before",
+                UserWarning,
+                where.file,
+                where.line,
+            )
 
     @property
     def signature(self) -> tuple:
