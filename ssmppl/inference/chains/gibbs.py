@@ -39,7 +39,12 @@ from ssmppl.inference.chains.sampling import (
 )
 from ssmppl.inference.methods.methods import Gibbs
 from ssmppl.inference.methods.requirements import need_density
-from ssmppl.inference.preparation.exact_models import ExactModel, exact_model, filter_of
+from ssmppl.inference.preparation.exact_models import (
+    ExactModel,
+    exact_model,
+    filter_of,
+    log_increments,
+)
 from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.draws import Block
@@ -58,9 +63,11 @@ class GibbsState:
 
 @dataclass(frozen=True)
 class GibbsSweeper(GibbsUpdates):
-    """A problem with its updates. interweaving : the further steps of a sweep."""
+    """A problem with its updates. interweaving : the further steps of a sweep. by_row : whether the
+    log-likelihood of each row is kept too."""
 
     interweaving: Interweaving | None = None
+    by_row: bool = False
 
 
 def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
@@ -81,7 +88,9 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     interweaving, interweaved = prepare_interweaving(setup, method.interweave, pilot, model)
-    steps = GibbsSweeper(problem, plan_updates(problem, setup.fixed), interweaving)
+    steps = GibbsSweeper(
+        problem, plan_updates(problem, setup.fixed), interweaving, method.log_likelihood
+    )
     starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []
     for chain, z in enumerate(starts):
@@ -123,6 +132,9 @@ def gibbs_block(
         draws["theta"].append(theta.copy())
         for i, path in enumerate(paths if with_paths else ()):
             draws[f"path_{i}"].append(path)
+        rows = log_increments(model, steps.problem.experiments, theta) if steps.by_row else ()
+        for i, row in enumerate(rows):
+            draws.setdefault(f"increment_{i}", []).append(row)
         stats["lp"].append(log_joint(steps, theta, paths))
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
         if interweaving is not None:
@@ -159,6 +171,7 @@ def explain(plan: Derived) -> Mapping[str, PlanRows]:
 METHOD = SamplingMethod(
     prepare,
     state_classes=(GibbsState, InterweavingTuning, Pilot),
+    by_row=lambda method: method.log_likelihood,
     where_slow=", or another method, such as ssm.MetropolisHastings()",
     explain=explain,
 )

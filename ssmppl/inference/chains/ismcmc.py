@@ -59,6 +59,7 @@ from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
 from ssmppl.inference.run.seeds import random_state
 
+EXACT, APPROXIMATE = "log_marginal_likelihood", "approximate_log_marginal_likelihood"
 LANES = 16  # of a chain, which may be corrected side by side
 # Steps between the draws that are kept: where most steps are independence proposals that are
 # accepted two make them nearly independent; of a walk it takes more, which cost less than filters.
@@ -123,7 +124,7 @@ class Lane:
 def correct_block(correction: Correction, lane: Lane, n: int) -> tuple[Lane, Block]:
     """The next n draws of a lane."""
     draws: dict[str, list[np.ndarray]] = {}
-    stats: dict[str, list[float]] = {"log_likelihood": [], "approximate_log_likelihood": []}
+    stats: dict[str, list[float]] = {EXACT: [], APPROXIMATE: []}
     for j in range(lane.done, lane.done + n):
         kept, *values = correction.corrected(lane.chain, j * LANES + lane.number)
         for name, value in kept.items():
@@ -290,8 +291,8 @@ def _weighted(
     chains: JumpChains, c: int, found: tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
 ) -> Weighted:
     draws, stats = found
-    n = len(stats["log_likelihood"])
-    correction = stats["log_likelihood"] - stats["approximate_log_likelihood"]
+    n = len(stats[EXACT])
+    correction = stats[EXACT] - stats[APPROXIMATE]
     stats = {**stats, "lp": chains.lp[c, :n] + correction}
     return Weighted(chains.theta[c, :n], chains.holding[c, :n], correction, draws, stats)
 

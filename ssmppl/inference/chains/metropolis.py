@@ -33,6 +33,7 @@ from ssmppl.inference.preparation.exact_models import (
     exact_model,
     filter_of,
     likelihood_by,
+    log_increments,
 )
 from ssmppl.inference.preparation.exact_score import exact_score
 from ssmppl.inference.preparation.pilot import Pilot, find_mode
@@ -82,11 +83,13 @@ class ExactLikelihood:
     """The exact filter's likelihood; states, if they are wanted, by backward sampling.
 
     scored : (P,) the parameters in which each run tells the gradient too; None: in none.
+    by_row : whether the log-likelihood of each row is kept too.
     """
 
     problem: Problem
     states: bool
     scored: np.ndarray | None = None
+    by_row: bool = False
 
     def run(
         self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
@@ -99,12 +102,16 @@ class ExactLikelihood:
         return LikelihoodRun(value, score=slope) if np.isfinite(value) else None
 
     def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
-        if not self.states:
-            return {}
         model = needed_model(self.problem, "MetropolisHastings")
         experiments = self.problem.experiments
-        drawn = model.draw_each(experiments, point.theta, [stream] * len(experiments))
-        return {f"path_{i}": d[0] for i, d in enumerate(drawn)}
+        out: dict[str, np.ndarray] = {}
+        if self.by_row:
+            rows = log_increments(model, experiments, point.theta)
+            out |= {f"increment_{i}": r for i, r in enumerate(rows)}
+        if self.states:
+            drawn = model.draw_each(experiments, point.theta, [stream] * len(experiments))
+            out |= {f"path_{i}": d[0] for i, d in enumerate(drawn)}
+        return out
 
 
 def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
@@ -116,8 +123,9 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     """
     problem, space = setup.problem, setup.space
     exact = needed_model(problem, "MetropolisHastings")
-    if isinstance(exact, Extended) and method == MetropolisHastings() and len(space.positions):
-        chains = _independent(setup, exact)
+    plain = replace(method, log_likelihood=False) == MetropolisHastings()
+    if isinstance(exact, Extended) and plain and len(space.positions):
+        chains = _independent(setup, exact, method)
         if chains is not None:
             return chains
     kind = filter_of(exact)
@@ -135,7 +143,9 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
             f"order=1 does not apply: {reason}", fix="use ssm.MetropolisHastings(order=0)"
         )
     usual = 0.574 if order else 0.44 if d <= 1 else 0.35 if d == 2 else 0.234
-    likelihood = ExactLikelihood(problem, setup.states, free if order else None)
+    likelihood = ExactLikelihood(
+        problem, setup.states, free if order else None, method.log_likelihood
+    )
     made = walk(setup, method, likelihood, where, pilot, kind, order, usual)
     chains = made.prepared()
     report = {
@@ -147,18 +157,20 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     return replace(chains, report=report)
 
 
-def _independent(setup: SamplingSetup, model: Extended) -> PreparedChains | None:
+def _independent(
+    setup: SamplingSetup, model: Extended, method: MetropolisHastings
+) -> PreparedChains | None:
     """Chains with proposals that do not depend on where they stand; None where no proposal is
     close enough to the posterior, so that a walk is better."""
     rng = np.random.default_rng(np.random.SeedSequence(setup.root.entropy, spawn_key=(19,)))
     kernel, states, report = independent_chains(
         setup.space, model, lambda i: setup.streams(i)[0], setup.chains, rng, setup.warmup,
-        setup.thin, setup.states,
+        setup.thin, setup.states, method.log_likelihood,
     )  # fmt: skip
     if report["proposal_ess_share"] < LEAST_SHARE:
         return None
     report |= {
-        "settings": settings_of(MetropolisHastings()),
+        "settings": settings_of(method),
         "likelihood": likelihood_by(model), "approximate": 1,
     }  # fmt: skip
     return PreparedChains(kernel.step_block, states, report)
@@ -172,5 +184,6 @@ def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray)
 METHOD = SamplingMethod(
     prepare,
     state_classes=(*WALK_STATES, LocalProposal, Pilot, Standing),
+    by_row=lambda method: method.log_likelihood,
     where_slow=", or another method, such as ssm.Gibbs()",
 )

@@ -400,7 +400,9 @@ def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[Walk
     """n draws of one chain, each after `thin` iterations (warmup draws are not thinned)."""
     state = replace(state, generator=copy.deepcopy(state.generator), stream=state.stream.copy())
     draws: dict[str, list[np.ndarray]] = {"theta": []}
-    stats: dict[str, list[float]] = {"log_likelihood": [], "lp": [], "acceptance_rate": []}
+    stats: dict[str, list[float]] = {
+        "log_marginal_likelihood": [], "lp": [], "acceptance_rate": []
+    }  # fmt: skip
     for _ in range(n):
         accepted, iterations = 0.0, kernel.thin if state.iteration >= kernel.warmup else 1
         for _ in range(iterations):
@@ -410,7 +412,7 @@ def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[Walk
         draws["theta"].append(point.theta)
         for name, value in kernel.likelihood.kept(point, state.stream).items():
             draws.setdefault(name, []).append(value)
-        stats["log_likelihood"].append(float(point.run.log_likelihood))
+        stats["log_marginal_likelihood"].append(float(point.run.log_likelihood))
         stats["lp"].append(float(point.run.log_likelihood + point.log_density))
         stats["acceptance_rate"].append(accepted)
     return state, Block.of(draws, stats)

@@ -84,6 +84,18 @@ def exact_kind(model: ExactModel | NotApplicable) -> str | NotApplicable:
     return model if isinstance(model, NotApplicable) else KIND[type(model)]
 
 
+def log_increments(
+    model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray
+) -> list[np.ndarray]:
+    """log p(y_t | y_{1:t-1}, theta) of each experiment, (T,).
+
+    Raises
+    ------
+    SamplingError : the distributions have no density at theta; names the step and the parameters.
+    """
+    return [model.filter(e, theta).log_increments for e in experiments]
+
+
 def exact_log_likelihood(
     trace: Trace, experiments: Iterable[Experiment], theta: np.ndarray
 ) -> float:

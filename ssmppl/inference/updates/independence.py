@@ -108,6 +108,7 @@ class IndependentChains:
     warmup: int
     thin: int
     states: bool
+    by_row: bool = False
 
     def start(self, generator: np.random.Generator, z: np.ndarray) -> Standing:
         """A chain from z (F,)."""
@@ -138,14 +139,25 @@ class IndependentChains:
                     "theta": state.thetas[rows], "log_likelihood": state.log_likelihoods[rows],
                     "lp": state.lps[rows], "acceptance_rate": state.rates[rows],
                     **{f"path_{i}": path[rows] for i, path in enumerate(state.paths)},
+                    **self._increments(state.thetas[rows]),
                 }  # fmt: skip
                 state = replace(state, at=state.at + k, count=state.count + k)
             for name, values in own.items():
                 parts.setdefault(name, []).append(values)
             n -= k
         whole = {name: np.concatenate(values) for name, values in parts.items()}
-        stats = {k: whole.pop(k) for k in ("lp", "acceptance_rate", "log_likelihood")}
+        stats = {k: whole.pop(k) for k in ("lp", "acceptance_rate")}
+        stats["log_marginal_likelihood"] = whole.pop("log_likelihood")
         return state, Block(whole, stats)
+
+    def _increments(self, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """log p(y_t | y_{1:t-1}, theta) (B, T) of each experiment at draws theta (B, P)."""
+        if not self.by_row:
+            return {}
+        data = self.space.problem.experiments
+        rows = self.model.increments(data, theta)
+        ends = np.cumsum([e.steps for e in data])[:-1]
+        return {f"increment_{i}": r for i, r in enumerate(np.split(rows, ends, axis=1))}
 
     def _repeated(self, state: Standing, k: int) -> dict[str, np.ndarray]:
         lp = state.log_target
@@ -285,14 +297,15 @@ def _inverse(information: np.ndarray) -> np.ndarray:
 
 def independent_chains(
     space: Space, model: Extended, streams: Callable[[int], np.random.Generator], chains: int,
-    rng: np.random.Generator, warmup: int, thin: int, states: bool,
+    rng: np.random.Generator, warmup: int, thin: int, states: bool, by_row: bool = False,
 ) -> tuple[IndependentChains, list[Standing], dict[str, Any]]:  # fmt: skip
     """The kernel, where its chains start, and what to report.
 
-    streams : the random numbers of each chain. rng : those of the fit.
+    streams : the random numbers of each chain. rng : those of the fit. by_row : whether draws come
+    with the log-likelihood of each row.
     """
     proposal, z, w = fitted(space, model, rng)
-    kernel = IndependentChains(space, model, proposal, warmup, thin, states)
+    kernel = IndependentChains(space, model, proposal, warmup, thin, states, by_row)
     begun = z[rng.choice(len(z), size=chains, p=w)]
     standing = [kernel.start(streams(i), begun[i]) for i in range(chains)]
     report = {

@@ -289,7 +289,10 @@ def _without_parameters(
 def _posterior(space: Space, result: Any) -> tuple[np.ndarray, np.ndarray]:
     """z (chains, draws, free) and log p(y | theta) + log prior + log Jacobian at each."""
     trace = space.problem.trace
-    posterior, likelihood = result["posterior"], result["sample_stats"]["log_likelihood"].values
+    posterior, likelihood = (
+        result["posterior"],
+        result["sample_stats"]["log_marginal_likelihood"].values,
+    )
     fixed = dict(zip(trace.parameter_symbols, space.theta, strict=True))
     z = np.empty((*likelihood.shape, len(space.positions)))
     total = likelihood.astype(float).copy()

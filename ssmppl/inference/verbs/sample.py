@@ -128,12 +128,16 @@ def sample(
         Groups:
 
         * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
-        * sample_stats (not of SMC2): lp, acceptance_rate, and log_likelihood (MetropolisHastings:
-          exact; PMMH: the estimate at the draw; ISMCMC: likewise, with the approximation's, and the
-          weight by which the draw was resampled in place of acceptance_rate) or update_rate and
+        * sample_stats (not of SMC2): lp, acceptance_rate, and log_marginal_likelihood
+          (log p(y | theta), one number of a draw; MetropolisHastings: exact; PMMH: the estimate at
+          the draw; ISMCMC: likewise, with the approximation's, and the weight by which the draw was
+          resampled in place of acceptance_rate) or update_rate and
           ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
-        * log_likelihood (PMMH; ISMCMC; PGAS on request): log p(y_t | y_1:t-1, theta), for
-          leave-future-out scores; az.loo on it is not valid, as the rows are not exchangeable;
+        * log_likelihood (PMMH; ISMCMC; Gibbs, MetropolisHastings and PGAS by their setting
+          `log_likelihood=True`): log p(y_t | y_1:t-1, theta). `az.loo` and `az.compare` take each
+          row's for that of an observation given all others, which it is not: what they print is
+          the score of one-step predictions with parameters that know the row itself, less a
+          correction for that, and says little of rows to come. `ssm.leave_future_out` does;
         * observed_data, constant_data (inputs).
 
         Attributes name method, settings, seed, versions, the plan, and the time taken; after PGAS

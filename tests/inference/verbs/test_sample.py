@@ -64,7 +64,9 @@ def test_groups_and_shapes(method):
     assert attrs["seconds"] > 0
     if isinstance(method, ssm.PMMH):
         per_step = idata["log_likelihood"]["y"].sum("time")
-        np.testing.assert_allclose(per_step, idata["sample_stats"]["log_likelihood"], rtol=1e-9)
+        np.testing.assert_allclose(
+            per_step, idata["sample_stats"]["log_marginal_likelihood"], rtol=1e-9
+        )
 
 
 def test_predictive_densities_after_pgas_on_request():
