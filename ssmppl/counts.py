@@ -18,7 +18,10 @@ def check_count(name: str, value: Any, least: int) -> None:
     """Refuse what is no whole number of at least `least`, or more than memory holds."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or value < least:
-        raise ArgumentError(f"{name}={value!r}", fix=f"give a whole number of at least {least}")
+        fix = f"give a whole number of at least {least}"
+        if isinstance(value, (float, np.floating)) and value >= least and value == value // 1:
+            fix = f"write {name}={int(value)}, a whole number"
+        raise ArgumentError(f"{name}={value!r}", fix=fix)
     check_room(f"{name}={value}", value, f"give a smaller {name}=")
 
 

@@ -443,7 +443,7 @@ def no_spread():
     return declare(transition=transition)
 
 
-@bad("'sigma'", "arguments of Normal are")
+@bad("'sigma'", "write sd=")
 def unknown_spread():
     def transition(x):
         return {"x": ssm.Normal(x, sigma=1)}  # HERE

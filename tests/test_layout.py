@@ -15,7 +15,16 @@ LONGEST = 800  # lines of a module
 MOST = 12  # modules of a room
 
 # Each layer and what it may import besides itself. The main chain, in its one direction:
-CHAIN = ["errors", "markup", "compiling", "expressions", "language", "analysis", "codegen"]
+CHAIN = [
+    "errors",
+    "arguments",
+    "markup",
+    "compiling",
+    "expressions",
+    "language",
+    "analysis",
+    "codegen",
+]
 ALLOWED = {layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)}
 # Arrays in, ArviZ out, and the embedded series stand beside it ...
 ALLOWED["counts"] = {"errors"}

@@ -87,6 +87,10 @@ def _file(data: Any) -> str:
 
 
 def _source(data: Any, label: str, argument: str, named: list[str]) -> Source:
+    if _is_series(data) and data.name in named:  # it says itself what it is
+        data = data.to_frame()
+    elif hasattr(data, "to_dataset") and getattr(data, "name", None) in named:
+        data = data.to_dataset()
     if hasattr(data, "data_vars") and hasattr(data, "coords"):
         return _from_dataset(data, label)
     if _is_table(data):
@@ -98,6 +102,11 @@ def _source(data: Any, label: str, argument: str, named: list[str]) -> Source:
 
 def _is_table(data: Any) -> bool:
     return hasattr(data, "iloc") and hasattr(data, "columns")
+
+
+def _is_series(data: Any) -> bool:
+    """Whether it is a column of a table of pandas, or of what is like it."""
+    return hasattr(data, "iloc") and hasattr(data, "to_frame")
 
 
 def _not_a_data_set(data: Any, label: str, argument: str, named: list[str]) -> DataError:
@@ -118,9 +127,8 @@ def _not_a_data_set(data: Any, label: str, argument: str, named: list[str]) -> D
     elif hasattr(data, "name") and hasattr(data, "__array__"):  # a Series, an Index or a DataArray
         kind, own = type(data).__name__, data.name
         found = f"{label} is a {kind}, one variable" + ("" if own is None else f" named {own!r}")
-        fix = (
-            f"give a mapping of variables by name: {{{some if own is None else own!r}: {argument}}}"
-        )
+        some = own if own in named else some
+        fix = f"give a mapping of variables by name: {{{some!r}: {argument}}}"
     elif isinstance(data, (np.ndarray, list, tuple)) or hasattr(data, "__array__"):
         found = f"{label} is {short(data)} of type {type(data).__name__}, which names no variable"
         fix = f"name it: {{{some!r}: {argument}}}"

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.structure import simulators
+from ssmppl.arguments import checked
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
@@ -69,6 +70,7 @@ PARTICLES = {"fast": 500, "full": 1000}
 TWISTED_PARTICLES = {"fast": 100, "full": 100}  # a few that know where to go do more
 
 
+@checked
 def diagnose(
     model: Model,
     data: Any,

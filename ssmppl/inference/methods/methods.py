@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ssmppl.arguments import checked_settings
 from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.methods.settings import (
@@ -37,6 +38,7 @@ ACCEPTANCE = optional(number(lambda v: 0.0 < v < 1.0, RATE))
 ESS = number(lambda v: 0.0 <= v <= 1.0, "give a number from 0 (never resample) to 1 (always)")
 
 
+@checked_settings
 @dataclass(frozen=True)
 class MetropolisHastings:
     """Metropolis-Hastings with the exact likelihood of a linear Gaussian model, of one of finitely
@@ -71,6 +73,7 @@ class MetropolisHastings:
     log_likelihood: bool = setting(False, flag)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class Gibbs:
     """Gibbs sampling of a model that is linear and Gaussian or has finitely many states (Schön et
@@ -89,6 +92,7 @@ class Gibbs:
     log_likelihood: bool = setting(False, flag)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class PMMH:
     """Particle Metropolis-Hastings: a random walk on the parameters with an unbiased estimate of
@@ -187,6 +191,7 @@ class PMMH:
             )
 
 
+@checked_settings
 @dataclass(frozen=True)
 class ISMCMC:
     """Markov chains on an approximate posterior, corrected by importance sampling (Vihola, Helske
@@ -224,6 +229,7 @@ class ISMCMC:
     target_acceptance: float | None = setting(None, ACCEPTANCE)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class PGAS:
     """Particle Gibbs with ancestor sampling (Lindsten, Jordan and Schön 2014; Schön et al. 2015,
@@ -256,6 +262,7 @@ class PGAS:
     eliminate: bool | str | tuple[str, ...] = setting(False, flag_auto_or_names)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class DirectOptimization:
     """Quasi-Newton ascent of the log-likelihood on the unconstrained scale (Schön et al. 2015,
@@ -287,6 +294,7 @@ class DirectOptimization:
     laplace: bool = setting(True, flag)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class EM:
     """Expectation maximisation of models that are linear and Gaussian or have finitely many states,
@@ -307,6 +315,7 @@ class EM:
     accelerate: bool = setting(True, flag)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class ParticleEM:
     """EM over a particle smoother: in each iteration fresh trajectories by backward simulation
@@ -341,6 +350,7 @@ class ParticleEM:
         check_count("iterations", self.iterations, self.burn_in + 1)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class PSAEM:
     """Particle stochastic approximation EM over the PGAS kernel (Lindsten 2013; Schön et al. 2015,
@@ -373,6 +383,7 @@ class PSAEM:
         check_count("iterations", self.iterations, self.burn_in + 1)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class ScoreAscent:
     """Stochastic approximation on particle estimates of the score (Poyiadjis, Doucet and Singh
@@ -412,6 +423,7 @@ class ScoreAscent:
             check_count("runs", self.runs, 2)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class IF2:
     """Iterated filtering (Ionides, Nguyen, Atchadé, Stoev and King 2015, algorithm IF2): a particle
@@ -462,6 +474,7 @@ class IF2:
     points: int | None = setting(None, optional(count(0)))
 
 
+@checked_settings
 @dataclass(frozen=True)
 class SMC2:
     """SMC^2 (Chopin, Jacob and Papaspiliopoulos 2013): particles in the parameters, each with a
@@ -494,6 +507,7 @@ class SMC2:
 Method = MetropolisHastings | Gibbs | PMMH | ISMCMC | PGAS | SMC2
 
 
+@checked_settings
 @dataclass(frozen=True)
 class KalmanSmoother:
     """Smoothing by Kalman passes: moments (Rauch, Tung and Striebel 1965), or independent draws by
@@ -509,12 +523,14 @@ class KalmanSmoother:
     proposal: str = setting("kalman", one_of(("kalman", "laplace", "extended", "unscented")))
 
 
+@checked_settings
 @dataclass(frozen=True)
 class ForwardBackward:
     """Exact smoothing where the states take finitely many values (Rabiner 1989): moments, or
     independent draws by backward sampling (Chib 1996)."""
 
 
+@checked_settings
 @dataclass(frozen=True)
 class FFBSi:
     """Forward filtering, backward simulation: independent draws, given the filter's particles, from
@@ -538,6 +554,7 @@ class FFBSi:
     rescue: int = setting(0, rescue_factor)
 
 
+@checked_settings
 @dataclass(frozen=True)
 class FixedLag:
     """Marginal moments from the filter's genealogy: x_t as the particles of step t + lag remember

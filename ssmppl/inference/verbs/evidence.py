@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import terms
+from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
@@ -91,6 +92,7 @@ class Evidence:
         return f"log evidence {self.log_evidence:.4f} (standard error {self.standard_error:.4f})"
 
 
+@checked
 def evidence(
     model: Model,
     data: Any,

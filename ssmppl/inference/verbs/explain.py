@@ -25,6 +25,7 @@ from ssmppl.analysis.structure import (
     simulators,
     singular_covariance,
 )
+from ssmppl.arguments import checked
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
@@ -305,6 +306,7 @@ def _update(update: Update) -> tuple[str, str]:
     return title, law
 
 
+@checked
 def explain(model: Model, data: Any = None) -> Plan:
     """The structure, proposals, default methods and Gibbs updates derived from a model, with
     reasons.
@@ -378,6 +380,7 @@ def _unread(
     return (("unused columns", named),)
 
 
+@checked
 def compile(model: Model, data: Any = None) -> Program:
     """Generate the program of a model.
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from ssmppl.analysis.structure import simulators
+from ssmppl.arguments import checked
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
+@checked
 def particle_filter(
     model: Model,
     data: Any,
@@ -256,6 +258,7 @@ def quantile_levels(quantiles: Iterable[float] | float) -> np.ndarray:
     return np.array(sorted(map(float, entries)))
 
 
+@checked
 def kalman_filter(
     model: Model,
     data: Any,
@@ -353,6 +356,7 @@ def normal_quantiles(mean: np.ndarray, sd: np.ndarray, levels: np.ndarray) -> np
     return found
 
 
+@checked
 def forward_filter(
     model: Model,
     data: Any,

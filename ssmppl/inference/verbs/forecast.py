@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing
+from ssmppl.arguments import checked
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.counts import check_room
 from ssmppl.data import (
@@ -51,6 +52,7 @@ KNOWN = (
 DRAWS = 1000
 
 
+@checked
 def forecast(
     model: Model,
     idata: Any,

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import logsumexp
 
+from ssmppl.arguments import checked
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, OK
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment
@@ -50,6 +51,7 @@ TIED = 1e-9  # difference of log weights that is rounding
 THRESHOLD = 0.7  # of the Pareto shape: beyond it the weights' errors are no longer known
 
 
+@checked
 def leave_future_out(
     model: Model,
     data: Any,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters
 from ssmppl.inference.gaussian.likelihood import (
@@ -33,6 +34,7 @@ BY_EXTENDED = (
 TASKS = 8  # pieces that repeats are cut into, so that an executor has something to share out
 
 
+@checked
 def log_likelihood(
     model: Model,
     data: Any,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.structure import noisy_start
+from ssmppl.arguments import checked
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
 from ssmppl.inference.batched.extended import Extended
@@ -66,6 +67,7 @@ TRAJECTORIES = 1000
 CLIMB = 20  # passes over the data of a climb where a simulator is called, most often
 
 
+@checked
 def maximize(
     model: Model,
     data: Any,

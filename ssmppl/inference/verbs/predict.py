@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing
+from ssmppl.arguments import checked
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import (
@@ -121,6 +122,7 @@ def _drawn(posterior: Any, name: str, shape: tuple[int, ...], over: tuple[str, .
     return values
 
 
+@checked
 def predict(
     model: Model,
     idata: Any = None,

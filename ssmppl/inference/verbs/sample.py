@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.structure import singular_covariance
+from ssmppl.arguments import checked
 from ssmppl.codegen.store.beforehand import beforehand
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
@@ -63,6 +64,7 @@ METHODS: dict[type, SamplingMethod] = {
 }
 
 
+@checked
 def sample(
     model: Model,
     data: Any,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters, check_values
 from ssmppl.errors import ArgumentError, NotApplicable
@@ -85,6 +86,7 @@ class Score:
         return "\n".join([*lines, "observed information", str(self.information)])
 
 
+@checked
 def score(
     model: Model,
     data: Any,

@@ -9,6 +9,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import flat_start
+from ssmppl.arguments import checked
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import (
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+@checked
 def simulate(
     model: Model,
     parameters: Mapping[str, Any] | None = None,

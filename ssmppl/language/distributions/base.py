@@ -16,7 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ssmppl.errors import Location, ModelError, UnsupportedOperation, nearest_first
+from ssmppl.arguments import OF_DISTRIBUTIONS, hint
+from ssmppl.errors import Location, ModelError, UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, constant, user_location
 from ssmppl.expressions.properties import never_negative
@@ -501,8 +502,8 @@ def misfit(
     options = f"{', '.join(most)} or {last}" if most else last
     unknown = [k for k in kwargs if k not in (*positional, *by_name)]
     if unknown:
-        nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
-        fix = f"the arguments of {name} are {nearest}"
+        found = f"{name} has no argument {unknown[0]!r}; given were {given}"
+        fix = hint(unknown[0], [*positional, *by_name], name, OF_DISTRIBUTIONS)
     elif by_name and len(args) > len(positional):
         found = f"{name} takes its {called} by name: {options}"
         arrays = any(np.ndim(a) for a in args if isinstance(a, np.ndarray))  # print as no Python

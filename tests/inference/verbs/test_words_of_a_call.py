@@ -120,8 +120,8 @@ def test_a_surface_needs_two_parameters():
 @pytest.mark.parametrize(
     ("data", "told", "fix"),
     [
-        (pd.Series([1.0, 2.0], name="y"), "Series, one variable named 'y'", "{'y': data}"),
-        (xr.DataArray([1.0, 2.0], dims="time", name="y"), "DataArray", "{'y': data}"),
+        (pd.Series([1.0, 2.0], name="z"), "Series, one variable named 'z'", "{'y': data}"),
+        (xr.DataArray([1.0, 2.0], dims="time", name="z"), "DataArray", "{'y': data}"),
         (pd.Series([1.0, 2.0]), "Series, one variable", "{'y': data}"),
         (xr.Dataset({"y": ("t", [1.0, 2.0])}), "are: t", "data.rename({'t': 'time'})"),
     ],
@@ -132,6 +132,19 @@ def test_fixes_of_data_can_be_done(data, told, fix):
     assert str(error.value).endswith(fix)
     fixed = eval(fix, {"data": data})
     assert ssm.kalman_filter(walk(), fixed, {"q": 1.0}).sizes["time"] == 2
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pd.Series([1.0, 2.0], name="y", index=pd.Index([3.0, 4.0], name="time")),
+        xr.DataArray([1.0, 2.0], dims="time", name="y", coords={"time": [3.0, 4.0]}),
+    ],
+    ids=["Series", "DataArray"],
+)
+def test_a_series_is_known_by_its_name(data):
+    found = ssm.kalman_filter(walk(), data, {"q": 1.0})
+    np.testing.assert_array_equal(found["time"], [3.0, 4.0])
 
 
 def test_arrays_in_a_fix_are_python():

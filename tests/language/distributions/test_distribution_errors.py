@@ -28,7 +28,7 @@ BAD = [
      "Normal(mean, sd=...)"),
     (lambda: D.Normal(X, 1, variance=2), "by name: sd=", "Normal(mean, sd=...)"),
     (lambda: D.Normal(0, std=1), "'std'", "sd"),
-    (lambda: D.Normal(0, sigma=1), "'sigma'", "arguments of Normal are"),
+    (lambda: D.Normal(0, sigma=1), "'sigma'", "write sd="),
     (lambda: D.Normal(), "missing a required argument: 'mean'", "Normal(mean, sd="),
     (lambda: D.Normal(sd=1), "missing a required argument: 'mean'", "mean"),
     (lambda: D.LogNormal(0, 1), "takes its spread by name: sd=", "LogNormal(0, sd=1)"),
