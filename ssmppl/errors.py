@@ -20,6 +20,8 @@ import difflib
 import linecache
 import os
 import sys
+import sysconfig
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -125,6 +127,26 @@ class SamplingError(SSMError):
 
 class ExecutorError(SSMError):
     """The executor failed, not the task: a worker died, or cannot restore what it was sent."""
+
+
+# Not the user's own lines, where a warning is to be looked for.
+_LIBRARIES = tuple(
+    str(path) for path in (
+        os.path.dirname(os.path.abspath(__file__)) + os.sep, sysconfig.get_path("stdlib"),
+        sysconfig.get_path("platlib"), sysconfig.get_path("purelib"),
+    )
+)  # fmt: skip
+_warned: dict[Any, Any] = {}
+
+
+def warn(text: str) -> None:
+    """Give a warning at the line of the user's that it is about: the innermost that is neither of
+    this package nor of a library."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_LIBRARIES):
+        frame = frame.f_back
+    file, line = frame.f_code.co_filename, frame.f_lineno
+    warnings.warn_explicit(text, UserWarning, file, line, registry=_warned)
 
 
 @dataclass(frozen=True)

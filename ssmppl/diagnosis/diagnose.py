@@ -154,7 +154,7 @@ class _Diagnosis:
     ):  # fmt: skip
         self.failures, self.horizon = failures, horizon
         self.began = time.perf_counter()
-        self.problem = pose(model, data)
+        self.problem = pose(model, data, noting=True)
         self.trace = self.problem.trace
         check_samplers(self.trace)
         self.experiments = self.problem.experiments

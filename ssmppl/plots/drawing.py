@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ssmppl.drawing.style import DATA, MAIN, bare, look, times
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, warn
 
 __all__ = [
     "MOST_PANELS", "dots", "fan", "few", "handed", "key", "line", "multiples", "only_below",
@@ -108,12 +108,9 @@ def only_below(axes: np.ndarray) -> None:
 def few(labels: list[str], verb: str) -> list[str]:
     """The first of too many panels, with a warning that says so."""
     if len(labels) > MOST_PANELS:
-        import warnings
-
-        warnings.warn(
+        warn(
             f"{verb} draws the first {MOST_PANELS} of {len(labels)} variables; choose others by "
-            "var_names=",
-            stacklevel=4,
+            "var_names="
         )
     return labels[:MOST_PANELS]
 

@@ -24,7 +24,6 @@ import stat
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -41,6 +40,7 @@ from numba.core.serialize import dumps
 
 from ssmppl.codegen.store import shipped
 from ssmppl.compiling import LOCK, once, one_at_a_time, uncollected
+from ssmppl.errors import warn
 
 try:
     import fcntl
@@ -78,10 +78,9 @@ def _is_private(folder: Path) -> bool:
     if not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not others_write):
         return True
     whose = "others can write to it" if others_write else "it belongs to somebody else"
-    warnings.warn(
+    warn(
         f"compiled models are not kept in {folder}: {whose}, and what lies there would be run. "
-        f"Remove the folder, or name one of your own: export SSMPPL_CACHE=...",
-        stacklevel=2,
+        f"Remove the folder, or name one of your own: export SSMPPL_CACHE=..."
     )
     return False
 

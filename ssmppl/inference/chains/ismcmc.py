@@ -21,7 +21,6 @@ the effective sample size from autocorrelations count them for what they are.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -30,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, warn
 from ssmppl.inference.chains.metropolis_kernel import (
     WALK_STATES,
     ChainPoint,
@@ -321,7 +320,7 @@ def _quality(chains: Sequence[Weighted], interrupted: bool) -> dict[str, Any]:
             "returned rests on few distinct draws. Use ssm.PGAS(...) or "
             "ssm.PMMH(...), or more draws and particles"
         )
-        warnings.warn(text, stacklevel=5)
+        warn(text)
         found["weights_warning"] = text
     return found
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import json
 import os
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from typing import Any
 import llvmlite.binding
 import numpy as np
 
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, warn
 from ssmppl.inference.checkpoints.archive import clear, no_checkpoint, read, unwritable, write
 from ssmppl.inference.checkpoints.codec import Codec, Store
 from ssmppl.inference.checkpoints.origin import Origin, origin_of
@@ -162,10 +161,9 @@ class CheckpointFile(Checkpoint):
             self._failed = False
         except OSError as error:
             if not self._failed:
-                warnings.warn(
+                warn(
                     f"the checkpoint {self.file} cannot be written: {error.strerror or error}. It "
-                    "stays as it was. Sampling goes on, its draws in memory, and tries again later",
-                    stacklevel=2,
+                    "stays as it was. Sampling goes on, its draws in memory, and tries again later"
                 )
             self._written, self._failed = time.monotonic(), True
 
@@ -223,11 +221,10 @@ class CheckpointFile(Checkpoint):
             raise no_checkpoint(self.file, WHAT, "its parts do not fit together") from error
         self._spool.check(self.file)
         if self._cpu != _cpu():
-            warnings.warn(
+            warn(
                 f"the checkpoint {self.file} was made on a CPU of type {self._cpu}, and this is "
                 f"{_cpu()}: sampling resumes, but draws may differ in the last digits from those "
-                "of an uninterrupted run",
-                stacklevel=3,
+                "of an uninterrupted run"
             )
 
     def _decode(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:

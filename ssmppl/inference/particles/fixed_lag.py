@@ -9,7 +9,6 @@ marginals only.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.data.times import label_text
+from ssmppl.errors import warn
 from ssmppl.inference.particles.backward import ParticleSystem
 
 LAG = 20
@@ -92,7 +92,7 @@ def collapse(
         f"particle{'s' if count > 1 else ''} among {draws} draws, and too few at {len(rows) - 1} "
         f"other rows; the smoothing variance is underestimated there. {fix}"
     )
-    warnings.warn(text, stacklevel=4)
+    warn(text)
     return {"smoothing_warning": text}
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import threading
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from ssmppl.errors import ExecutorError
+from ssmppl.errors import ExecutorError, warn
 from ssmppl.inference.run.draws import Arrays, Block, ChainDraws, Checkpoint, Standing, joined
 from ssmppl.inference.run.executors import (
     Absent,
@@ -217,10 +216,7 @@ class _RunningChains(Generic[State]):
         if interrupted and kept == 0:
             raise self.lost or KeyboardInterrupt("interrupted before every chain had a draw")
         if self.lost is not None:
-            warnings.warn(
-                f"{kept} of {self.draws} draws of each chain are returned: {self.lost}",
-                stacklevel=4,
-            )
+            warn(f"{kept} of {self.draws} draws of each chain are returned: {self.lost}")
         return [
             ChainDraws(
                 draws=joined([block.draws for block in chain.blocks], kept),

@@ -14,7 +14,6 @@ the states change, row by row, is their diagnostic.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from ssmppl.errors import warn
 from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
@@ -68,7 +68,7 @@ def mixing_attributes(
         f"intervals are used. Take more draws (there were {n} of each chain) and warmup ({warmup})"
         + advice
     )
-    warnings.warn(text, stacklevel=3)
+    warn(text)
     return {"mixing_warning": text}
 
 
@@ -211,7 +211,7 @@ def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) 
         f"path degeneracy: {where} changed in fewer than {LOW:.0%} of the draws; those states, and "
         "parameters that depend on them, have not converged. Take more particles, or ssm.PMMH()"
     )
-    warnings.warn(text, stacklevel=3)
+    warn(text)
     return {"trajectory_update_rate": least, "trajectory_warning": text}
 
 

@@ -16,6 +16,7 @@ from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
 from ssmppl.codegen.modules.program import OWN_MODULES, Program, compile_trace
 from ssmppl.data import Experiment, bind
+from ssmppl.data.notices import warn_of
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
@@ -125,8 +126,10 @@ def missing_of(experiments: Sequence[Experiment]) -> Missing:
     return Missing(none, partial.union(*(e.partial for e in experiments)))
 
 
-def pose(model: Model, data: Any) -> Problem:
+def pose(model: Model, data: Any, *, noting: bool = False) -> Problem:
     """Trace the model, bind the data and compile.
+
+    noting : whether to warn of what the data seem to lack (`data/notices.py`).
 
     Raises
     ------
@@ -140,4 +143,6 @@ def pose(model: Model, data: Any) -> Problem:
             where=model.location,
         )
     experiments = tuple(bind(traced, data))
+    if noting:
+        warn_of(traced, data, experiments)
     return Problem(traced, experiments, compile_trace(traced, missing_of(experiments)))

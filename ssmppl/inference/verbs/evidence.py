@@ -138,7 +138,7 @@ def evidence(
         check_count(name, value, least)
     check_executor(executor)
     check_settings(method)
-    problem = pose(model, data)
+    problem = pose(model, data, noting=True)
     fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
     _refuse_improper(problem, fixed_values)

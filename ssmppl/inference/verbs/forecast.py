@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ from ssmppl.data import (
 from ssmppl.data.parameters import pack, pack_states
 from ssmppl.data.time_steps import lengths
 from ssmppl.data.times import label_text, spacing
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, warn
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
@@ -279,11 +278,10 @@ def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
         if regular is not None:
             return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=regular)[1:])
         if len(time) > 2:
-            warnings.warn(
+            warn(
                 "the dates of the data are not evenly spaced, so that the rows of the forecast are "
                 f"numbered on from {len(time) + 1}. Where a row is absent from the data, give it, "
-                "with NaN for what was not measured: each row is one step of the model",
-                stacklevel=3,
+                "with NaN for what was not measured: each row is one step of the model"
             )
     elif np.issubdtype(time.dtype, np.timedelta64):  # NumPy takes these for numbers too
         gaps = np.diff(time)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters
+from ssmppl.errors import warn
 from ssmppl.inference.gaussian.likelihood import (
     APPROXIMATE,
     approximate_log_likelihood,
@@ -129,7 +129,7 @@ def log_likelihood(
     )  # fmt: skip
     if settings.proposal in EXACT:
         if proposal == "auto" and settings.proposal == "extended":
-            warnings.warn(BY_EXTENDED, stacklevel=2)
+            warn(BY_EXTENDED)
         exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
     task = estimates_task(problem, theta, settings, seed_sequence(seed))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, replace
@@ -14,7 +13,7 @@ import numpy as np
 from ssmppl.analysis.structure import noisy_start
 from ssmppl.arguments import checked
 from ssmppl.data import check_values, unpack_parameters
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, warn, written_as
 from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.batched.reckoning import reckon
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
@@ -120,7 +119,7 @@ def maximize(
         )
     check_executor(executor)
     check_settings(method)
-    problem = pose(model, data)
+    problem = pose(model, data, noting=True)
     fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
     twice = [n for n in near if n in fixed_values]
@@ -180,10 +179,9 @@ def choose_method(setup: Maximization) -> tuple[Any, str]:
         laplace = found if isinstance(found, NotApplicable) else None
     chosen, reason = choose_maximiser(exact_kind(setup.exact), trace, laplace)
     if isinstance(chosen, ScoreAscent) and noisy_start(trace):
-        warnings.warn(
+        warn(
             f"{type(chosen).__name__} may take minutes for each hundred rows here: "
-            f"{start_as_parameter(trace)}",
-            stacklevel=3,
+            f"{start_as_parameter(trace)}"
         )
     return chosen, f"automatically: {reason}"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ import numpy as np
 from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters, check_values
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable, warn
 from ssmppl.inference.maximum.estimate import by_name, table
 from ssmppl.inference.particles.scores import (
     ParticleScore,
@@ -202,10 +201,9 @@ def _score(
 
     slopes = zip(labels, found.gradient[free], strict=True)
     if none := [f"{n} is {g:g}" for n, g in slopes if not np.isfinite(g)]:
-        warnings.warn(
+        warn(
             "gradient is not finite at these parameters (e.g. sqrt or log at 0): the score in "
-            f"{', '.join(none)}",
-            stacklevel=3,
+            f"{', '.join(none)}"
         )
     return Score(
         named(found.gradient), labelled(found.information), found.log_likelihood,

@@ -369,7 +369,7 @@ def smooth(
     began = time.perf_counter()
     method = _with_proposal(method, proposal)
     check_settings(method)
-    problem = pose(model, data)
+    problem = pose(model, data, noting=True)
     theta = check_parameters(problem.trace, parameters)
     chosen, why = _choose(problem, method)
     levels = quantile_levels(quantiles)

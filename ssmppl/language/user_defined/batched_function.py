@@ -12,13 +12,12 @@ import itertools
 import threading
 import time
 import traceback
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import Location, SimulatorError
+from ssmppl.errors import Location, SimulatorError, warn
 
 Call = Callable[[np.ndarray, np.ndarray, np.ndarray], Any]
 
@@ -106,11 +105,10 @@ class BatchedFunction:
             if self.undefined == bad.sum():  # the first ones
                 k = int(np.argmax(bad))
                 lost = ", ".join(np.array(self.results)[np.isnan(values[k])])
-                warnings.warn(
+                warn(
                     f"the simulator {self.title} gives NaN for {lost} at "
                     f"{self._point_text(points[k])}{self._reason(points[k])}; where it does the "
-                    "likelihood is zero",
-                    stacklevel=2,
+                    "likelihood is zero"
                 )
         return values
 

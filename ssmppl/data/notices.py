@@ -1,0 +1,54 @@
+"""What a user may not know of the data: noticed where something is estimated from them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ssmppl.data.binding import Experiment, unread
+from ssmppl.data.times import spacing
+from ssmppl.errors import warn
+from ssmppl.language.model.trace import Trace
+
+OF_TIME = re.compile(
+    r"(?i)(.*_)?(date|time|datetime|timestamp|day|week|month|quarter|year)s?(_.*)?"
+)
+
+
+def warn_of(trace: Trace, data: Any, experiments: Sequence[Experiment]) -> None:
+    """Warn of rows that seem to be absent, of columns that hold nothing, and of times that nobody
+    reads."""
+    for text in (*_steps(trace, experiments), *_empty(trace, experiments)):
+        warn(text)
+    if all(e.time is None for e in experiments):
+        for column in filter(OF_TIME.fullmatch, unread(trace, data)):
+            warn(
+                f"the column {column!r} is not used, and rows have numbers: call it `time` to "
+                "label them, by which absent rows are noticed"
+            )
+
+
+def _steps(trace: Trace, experiments: Sequence[Experiment]) -> list[str]:
+    """Of the first data set whose steps differ, unless the model reads their lengths."""
+    if trace.time_step is not None:
+        return []
+    for e in experiments:
+        found = "" if e.time is None else spacing(e.time)
+        if found:
+            return [
+                f"the steps of the data are {found}. Give absent rows with NaN for what was not "
+                'measured, or declare ssm.Model(..., time_step="dt")'
+            ]
+    return []
+
+
+def _empty(trace: Trace, experiments: Sequence[Experiment]) -> list[str]:
+    """Of what is missing in every row."""
+    seen = np.any([np.any(e.seen == 1.0, axis=0) for e in experiments], axis=0)
+    lost = [repr(s) for s, any_ in zip(trace.observation_symbols, seen, strict=True) if not any_]
+    if not lost:
+        return []
+    return [f"{', '.join(lost)}: missing in every row, so that the data say nothing of it"]

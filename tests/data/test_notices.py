@@ -1,0 +1,83 @@
+"""What is noticed of data where something is estimated from them."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import ssmppl as ssm
+from ssmppl.errors import _warned
+
+DATES = pd.date_range("2020-01-01", periods=12, freq="MS")
+Y = np.cumsum(np.random.default_rng(1).normal(size=12))
+
+
+def level(**options):
+    model = ssm.Model("level", **options)
+
+    @model.prior
+    def prior():
+        return {"q": ssm.InverseGamma(3, scale=1)}
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x, q):
+        return {"x": ssm.Normal(x, variance=q)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=1), "z": ssm.Normal(x, sd=2)}
+
+    return model
+
+
+def table(**columns):
+    return pd.DataFrame({"y": Y, "z": Y} | columns)
+
+
+def said(model, data, verb=ssm.maximize):
+    _warned.clear()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        verb(model, data, progress=False)
+    for w in caught:
+        assert w.filename == __file__  # the user's own line
+    return [str(w.message) for w in caught]
+
+
+CASES = {
+    "all is well": (table(time=DATES), []),
+    "numbered rows": (table(), []),
+    "a month is absent": (
+        table(time=DATES).drop(index=4),
+        ["the steps of the data are from 29 days to 61 days long"],
+    ),
+    "rows were dropped": (table().drop(index=4), ["the steps of the data are from 1 to 2 long"]),
+    "nothing in a column": (table(z=np.nan), ["z: missing in every row"]),
+    "dates that nobody reads": (table(date=DATES), ["the column 'date' is not used"]),
+    "dates beside others": (table(time=DATES, month=DATES), []),
+    "another column": (table(updates=1.0), []),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_noticed(case):
+    data, expected = CASES[case]
+    found = said(level(), data)
+    assert len(found) == len(expected)
+    assert all(a.startswith(b) for a, b in zip(found, expected, strict=True))
+
+
+def test_steps_that_the_model_reads_are_no_surprise():
+    assert said(level(time_step="dt", time_unit="D"), table(time=DATES).drop(index=4)) == []
+
+
+def test_sampling_notices_too():
+    def short(model, data, progress):
+        return ssm.sample(model, data, draws=4, warmup=4, chains=1, seed=1, progress=progress)
+
+    assert len(said(level(), table(date=DATES), short)) == 1
