@@ -188,9 +188,12 @@ def _from_frame(data: Any, label: str, named: list[str]) -> Source:
             "[part.droplevel(0) for _, part in data.groupby(level=0)]",
             where=source.place(),
         )
-    if _informative(data.index):
+    column = "time" in names and "time" not in named
+    # Whole numbers are what is left of row numbers where rows were dropped or chosen.
+    numbers = getattr(data.index.dtype, "kind", "") in "iu"
+    if _informative(data.index) and not (column and numbers):
         source.time = _labels(data.index, source, "index")
-    elif "time" in names and "time" not in named:
+    elif column:
         source.time_name = "time"
         source.time = _labels(source.columns.pop("time"), source)
     return source

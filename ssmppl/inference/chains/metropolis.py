@@ -123,7 +123,8 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     """
     problem, space = setup.problem, setup.space
     exact = needed_model(problem, "MetropolisHastings")
-    plain = replace(method, log_likelihood=False) == MetropolisHastings()
+    asked = method.covariance is not None or method.transform is not None
+    plain = not asked and replace(method, log_likelihood=False) == MetropolisHastings()
     if isinstance(exact, Extended) and plain and len(space.positions):
         chains = _independent(setup, exact, method)
         if chains is not None:
