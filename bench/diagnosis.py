@@ -26,7 +26,7 @@ from table import machine, show, versions
 import ssmppl as ssm
 
 STEP, FINE = 0.05, 10  # seconds a row, steps of the machine in one
-FRICTION, WIDTH = 0.8, 0.05  # rad/s^2, and rad/s over which it turns
+FRICTION, WIDTH = 1.5, 0.05  # rad/s^2, and rad/s over which it turns
 GOALS = {("full", 1000): 60, ("full", 200): 30, ("fast", 1000): 10, ("fast", 200): 10}  # seconds
 
 pendulum = ssm.Model("pendulum", inputs=("u",))

@@ -27,9 +27,12 @@ from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, proposal_
 from ssmppl.diagnosis.fitting.bounds import bounds_note
 from ssmppl.diagnosis.fitting.fit import Fit, Fitter
 from ssmppl.diagnosis.heldout.cross_validation import FOLDS_CALLED, CrossValidation
-from ssmppl.diagnosis.heldout.fewer_effects import drop_by_later_rows
+from ssmppl.diagnosis.heldout.fewer_effects import (
+    HeldOutTest,
+    drop_by_held_out_rows,
+    drop_by_later_rows,
+)
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
-from ssmppl.diagnosis.heldout.predictions import Predictions, predict
 from ssmppl.diagnosis.heldout.reference import gain_of_curves
 from ssmppl.diagnosis.heldout.row_split import FOLDS, RowSplit, long_enough, three_parts
 from ssmppl.diagnosis.model.candidates import Chosen
@@ -49,7 +52,6 @@ from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.effect_selection import (
     EffectSelection,
     SelectionResult,
-    add_standard_errors,
 )
 from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.errors import ArgumentError, SSMError, listing
@@ -266,10 +268,13 @@ class _Diagnosis:
             return
         with self.failures.guard("whether several effects predict better than fewer"):
             if self.split:
-                drop_by_later_rows(
-                    found, self.split, self._seed(Stage.SELECTION), self.checkpoint
+                seed = self._seed(Stage.SELECTION)
+                drop_by_later_rows(found, self.split, seed, self.checkpoint)
+                held_out = HeldOutTest(
+                    (r.base, r.fit), r.simulator, self.split, self.horizon,
+                    self._seed(Stage.HELD_OUT),
                 )  # fmt: skip
-            self._validate_on_held_out_rows(r)
+                drop_by_held_out_rows(found, held_out, seed, self.checkpoint)
         if found.chosen is not None:
             with self.failures.guard("who is taken for whom"):
                 r.recovery = recovery(
@@ -285,45 +290,6 @@ class _Diagnosis:
             self._separating_experiment(r)
         with self.failures.guard("how far the gap closes"):
             r.held_out = self._held_out_gain(r)
-
-    def _validate_on_held_out_rows(self, r: Results) -> None:
-        """Drop effects of several chosen together while all of them predict the held-out
-        rows no better than the model itself: what they fitted was chance. It is a choice made on
-        these rows, and the report says so."""
-        found = r.selection
-        if not self.split or found is None or found.chosen is None or not found.fewer:
-            return
-        try:
-            plain = self._held_out_predictions(r.base, r.fit)
-        except SSMError:  # as will be said where the gain is measured
-            return
-        while found.fewer:
-            last = found.chosen
-            try:
-                seen = self._held_out_predictions(last.fitter, last.fit)
-            except SSMError as error:
-                found.notes.append(
-                    f"{' and '.join(map(str, last.candidates))} fit better together, and whether "
-                    f"they predict held-out rows better is not known: {error.found}"
-                )
-                return
-            gain = seen.log_density.sum(axis=1).mean() - plain.log_density.sum(axis=1).mean()
-            if gain > 0.0:
-                return
-            found.chosen, found.left_out = found.fewer.pop(), True
-            add_standard_errors(found, self._seed(Stage.SELECTION), self.checkpoint)
-            found.notes.append(
-                f"{' and '.join(map(str, last.candidates))} fit better together, and have lower "
-                f"held-out predictive density than the base model ({gain:.1f} nats); retained: "
-                + " and ".join(map(str, found.chosen.candidates))
-            )
-
-    def _held_out_predictions(self, fitter: Fitter, fit: Fit) -> Predictions:
-        """One-step predictions of the held-out rows."""
-        assert self.split is not None
-        return predict(
-            fitter, fit, self.experiments, self.split.held_out, self._seed(Stage.HELD_OUT)
-        )
 
     def _held_out_gain(self, r: Results) -> HeldOutGain:
         # Beside a pulse, which later rows cannot tell of, they tell what carries on.

@@ -21,7 +21,6 @@ from ssmppl.diagnosis.heldout.predictions import (
 )
 from ssmppl.diagnosis.heldout.row_split import three_parts, without
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.errors import SamplingError
 from ssmppl.inference.run.problem import pose
 from tests.diagnosis.small import level, levels
 from tests.statistics.checks import seed_of
@@ -114,31 +113,6 @@ def test_a_held_out_row_that_cannot_be_leaves_the_rest_of_the_report(monkeypatch
     assert len(report.free_run) == 320
     (note,) = [n for n in report.notes if "share of the reference model's gain" in n]
     assert "could not be computed: all weights are zero at t=301" in note
-
-
-@pytest.mark.parametrize("which", [0, 1])
-def test_effects_stay_together_where_held_out_rows_cannot_be_predicted(monkeypatch, which):
-    """Of the model itself, of both together: nothing is left out for it, and nothing raised."""
-    asked = []
-
-    def impossible(fitter, fit, *_):
-        asked.append(fitter)
-        if len(asked) == which + 1:
-            raise SamplingError("all weights are zero at t=301", fix="look at it", where=None)
-        return SimpleNamespace(log_density=np.zeros((2, 5)))
-
-    monkeypatch.setattr(diagnose, "predict", impossible)
-    run = object.__new__(diagnose._Diagnosis)
-    run.split, run.experiments = SimpleNamespace(held_out=[]), ()
-    run.root = np.random.SeedSequence(1)
-    both = SimpleNamespace(fitter="both", fit=None, candidates=("drag", "friction"))
-    found = SimpleNamespace(chosen=both, fewer=["one"], notes=[])
-    run._validate_on_held_out_rows(SimpleNamespace(selection=found, base="base", fit=None))
-    assert found.chosen is both
-    assert len(asked) == which + 1
-    assert found.notes == ["drag and friction fit better together, and whether they predict "
-                           "held-out rows better is not known: all weights are zero at t=301"
-                           ][:which]  # fmt: skip
 
 
 def sensors(n, together):

@@ -7,7 +7,11 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.heldout import fewer_effects
-from ssmppl.diagnosis.heldout.fewer_effects import drop_by_later_rows
+from ssmppl.diagnosis.heldout.fewer_effects import (
+    HeldOutTest,
+    drop_by_held_out_rows,
+    drop_by_later_rows,
+)
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.selection.effect_selection import SelectionResult
 from ssmppl.errors import SamplingError
@@ -62,6 +66,76 @@ def test_what_does_not_carry_is_not_named(monkeypatch, names, later, left):
     if found.notes:
         assert found.notes[-1].endswith("retained: " + " and ".join(names[:left]))
     assert not found.left_out  # no held-out row was looked at
+
+
+def held_out(gains, worse=(), fails=None):
+    """A test of which these effects' numbers gain so much, simulate worse, cannot be looked at."""
+
+    def predictions(fitter, fit=None):
+        if fitter == fails:
+            raise SamplingError("all weights are zero at t=301", fix="look at it")
+        gain = ({0: 0.0} | gains)[fitter]
+        return SimpleNamespace(log_density=np.full((8, 4), gain / 4.0))
+
+    return SimpleNamespace(
+        base=(0, None), predictions=predictions,
+        simulated_worse=lambda refit: 0.19 if refit.fitter in worse else 0.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("gains", "worse", "left"),
+    [
+        ({1: 5.0, 2: 4.0, 3: 2.0}, (), 3),
+        ({1: 5.0, 2: 4.0, 3: -2.0}, (), 2),
+        ({1: 5.0, 2: -4.0, 3: -2.0}, (), 1),
+        ({1: -5.0, 2: -4.0, 3: -2.0}, (), 1),
+        ({1: 5.0, 2: 4.0, 3: 2.0}, (3,), 2),  # a break whose new value did not last
+        ({1: 5.0, 2: 4.0, 3: 2.0}, (1, 2, 3), 1),
+        ({1: 5.0, 2: -4.0, 3: 2.0}, (3,), 1),
+    ],
+)
+def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, worse, left):
+    """The number of effects left, by what each number of them gains on the held-out rows."""
+    monkeypatch.setattr(fewer_effects, "add_standard_errors", lambda *_: None)
+    found = chain("abc")
+    drop_by_held_out_rows(found, held_out(gains, worse), None, Checkpoint(None, {}))
+    assert len(found.chosen.candidates) == left
+    assert len(found.notes) == 3 - left
+    assert found.left_out is (left < 3)
+    if found.notes:
+        assert found.notes[-1].endswith(f"retained: {' and '.join('abc'[:left])}")
+    if worse and left == 2:
+        assert "simulate held-out rows worse than the base model (error +19%)" in found.notes[0]
+
+
+@pytest.mark.parametrize("which", [0, 2])
+def test_effects_stay_together_where_held_out_rows_cannot_be_predicted(which):
+    """Of the model itself, of both together: nothing is left out for it, and nothing raised."""
+    found = chain("ab")
+    drop_by_held_out_rows(found, held_out({2: -5.0}, fails=which), None, Checkpoint(None, {}))
+    assert len(found.chosen.candidates) == 2
+    assert found.notes == ["a and b fit better together, and whether they predict held-out rows "
+                           "better is not known: all weights are zero at t=301"
+                           ][:which]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("share", "high", "worse"), [(-0.19, -0.05, 0.19), (-0.19, 0.02, 0.0), (0.3, 0.4, 0.0)]
+)
+def test_simulations_are_worse_only_beyond_chance(monkeypatch, share, high, worse):
+    asked = []
+    monkeypatch.setattr(fewer_effects, "horizons", lambda *_: ["100", "1 to 79"])
+    monkeypatch.setattr(fewer_effects, "compared", lambda *a: asked.append(a))
+    monkeypatch.setattr(
+        fewer_effects, "table_rows", lambda *_: [{"share": share, "high": high, "low": -1.0}]
+    )
+    split = SimpleNamespace(experiments=(), held_out=())
+    test = HeldOutTest(("m", 1), ("m", 2), split, None, None)
+    chosen = SimpleNamespace(simulator=("with", 3))
+    assert test.simulated_worse(chosen) == worse
+    assert asked[0][:2] == (("m", 2), ("with", 3))
+    assert asked[0][4] == ["1 to 79"]  # the windows
 
 
 @pytest.mark.slow

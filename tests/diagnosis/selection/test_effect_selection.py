@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ssmppl.diagnosis import diagnose as diagnosis
 from ssmppl.diagnosis.effects import catalogue_sensor as ssm_effects
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.catalogue import effects
@@ -293,33 +292,6 @@ def test_of_refits_that_differ_in_their_shape_the_best_stands():
     screen = delayed_screen()
     found = best_of_groups(screen, [refit_at(k, m) for k, m in ((0, 5.0), (3, 7.0), (1, 9.0))])
     assert [(r.index[0], r.gain) for r in found] == [(1, 9.0), (3, 7.0)]
-
-
-@pytest.mark.parametrize(
-    ("gains", "left"),
-    [({1: 5.0, 2: 4.0, 3: 2.0}, 3), ({1: 5.0, 2: 4.0, 3: -2.0}, 2), ({1: 5.0, 2: -4.0, 3: -2.0}, 1),
-     ({1: -5.0, 2: -4.0, 3: -2.0}, 1)],
-)  # fmt: skip
-def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left):
-    """The number of effects left, by what each number of them gains on the held-out rows."""
-    chain = [Refit(tuple(range(n)), ("effect",) * n, n, None, 10.0 * n) for n in (1, 2, 3)]
-    out = SelectionResult(None, chosen=chain[2], fewer=chain[:2])
-    results = SimpleNamespace(selection=out, base=0, fit=None)
-
-    def predict(fitter, *_):
-        return SimpleNamespace(log_density=np.full((8, 4), ({0: 0.0} | gains)[fitter] / 4.0))
-
-    monkeypatch.setattr(diagnosis, "predict", predict)
-    monkeypatch.setattr(diagnosis, "add_standard_errors", lambda out, *_: None)
-    running = object.__new__(diagnosis._Diagnosis)
-    running.split, running.experiments = SimpleNamespace(held_out=[]), ()
-    running.root, running.checkpoint = seed_sequence(1), Checkpoint(None, {})
-    running._validate_on_held_out_rows(results)
-    assert len(out.chosen.candidates) == left
-    assert len(out.notes) == 3 - left
-    assert out.left_out is (left < 3)
-    if out.notes:
-        assert out.notes[-1].endswith(f"retained: {' and '.join(['effect'] * left)}")
 
 
 @pytest.mark.parametrize(
