@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SIGNIFICANT_GAIN_SE = 2.0  # standard errors of a gain beyond the catalogue that is no chance
-LEAST_SHARE_LEFT = 0.15  # of the gap, by the catalogue, before it is "none of these"
+# By the catalogue, of the gap one row ahead and of the error that curves take off simulations,
+# before it is "none of these": an effect that closes most of a gap is what a user has to know.
+LEAST_SHARE_LEFT, LEAST_ERROR_LEFT = 0.3, 0.15
 FAR_MORE = 2.0  # times what the chosen effects gain, by curves in their place: "none of these"
 RESIDUAL_ALPHA_SHARE = 0.2  # of alpha, for what the catalogue leaves where nothing is held out
 
@@ -148,7 +150,7 @@ def curves_beat(far: HeldOutGain, chosen: bool) -> bool:
     if not chosen or far.simulated_beyond is None:
         return True
     better, low = far.simulated_beyond
-    return low > 0.0 and better > LEAST_SHARE_LEFT
+    return low > 0.0 and better > LEAST_ERROR_LEFT
 
 
 def testable_candidates(screen: Screen) -> list[Candidate]:

@@ -30,6 +30,8 @@ from tests.models import gaps as models
         (16.0, 3.0, 0.58, (0.4, -0.1), True, False),  # as far as simulations tell
         (16.0, 3.0, 0.58, (0.1, 0.05), True, False),  # a trifle, many rows ahead
         (16.0, 9.0, 0.58, (0.4, 0.2), True, False),  # chance explains it
+        (16.0, 3.0, 0.69, (0.16, 0.1), True, True),
+        (16.0, 3.0, 0.71, (0.16, 0.1), True, False),  # friction, in steps too coarse for it
         (2.9, 0.9, 0.94, None, True, False),  # the catalogue's effects close nearly all
         (6.0, 2.0, float("nan"), None, True, True),  # no share is given
         (6.0, 2.0, 1.0, None, False, True),  # nothing was chosen: the share is the curves' own
