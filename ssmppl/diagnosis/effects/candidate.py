@@ -107,7 +107,7 @@ class Candidate:
         """The same in each of the inputs in which it happens, its own first."""
         return [replace(self, equation=label, alike=()) for label in (self.equation, *self.alike)]
 
-    @property
+    @cached_property
     def key(self) -> str:
         """One text for each candidate; the same for increments that are the same."""
         profile = PROFILES.get(self.effect.profile)

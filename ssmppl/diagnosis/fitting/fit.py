@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
+from ssmppl.compiling import once_property
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.fitting.bounds import flat_outwards, hold_at_bounds
 from ssmppl.diagnosis.fitting.densities import (
@@ -186,6 +187,25 @@ def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, floa
     return {repr(s): float(v) for s, v in zip(symbols, spread, strict=True)}
 
 
+@dataclass(frozen=True)
+class _Scores:
+    """The scores of a model and what smooths them, made once for all copies of a fitter and only
+    where they are asked for: a fit that is looked at again has no need of them."""
+
+    problem: Problem
+    held: tuple[str, ...]
+    settings: Settings
+
+    @once_property
+    def columns(self) -> ScoreExpressions:
+        trace, missing = self.problem.trace, self.problem.program.missing
+        return score_columns(trace, trace, (), self.held, missing)
+
+    @once_property
+    def smoother(self) -> Smoother:
+        return Smoother(self.columns, self.problem.program.missing, self.settings)
+
+
 class Fitter:
     """Fits one model to any of its data sets."""
 
@@ -197,13 +217,22 @@ class Fitter:
         self.problem, self.fixed, self.settings = problem, dict(fixed), settings
         self.initial_law = initial_law
         self.kalman = kalman_model(problem.trace)
-        trace = problem.trace
-        self.columns: ScoreExpressions = score_columns(
-            trace, trace, (), self.fixed, problem.program.missing
-        )
-        self.smoother = Smoother(self.columns, problem.program.missing, settings)
-        place = {s: i for i, s in enumerate(trace.parameter_symbols)}
-        self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)
+        self._scores = _Scores(problem, tuple(self.fixed), settings)
+
+    @property
+    def columns(self) -> ScoreExpressions:
+        """The scores in the parameters that were free to begin with."""
+        return self._scores.columns
+
+    @property
+    def smoother(self) -> Smoother:
+        return self._scores.smoother
+
+    @property
+    def where(self) -> np.ndarray:
+        """(C,) places of the parameters that have a score."""
+        place = {s: i for i, s in enumerate(self.problem.trace.parameter_symbols)}
+        return np.array([place[s] for s in self.columns.nuisance], dtype=int)
 
     def with_fixed(self, values: Mapping[str, Any]) -> Fitter:
         """The same with other values of parameters that are fixed."""

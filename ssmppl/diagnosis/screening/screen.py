@@ -232,11 +232,17 @@ class Screen:
         """(B, K), (K,) scores of these candidates, simulated and observed; of those among them
         whose statistic is a sum of scores. A shape that the screen has not (a period that was
         refined) stands for the best one of its group."""
-        known = {c.key: k for k, c in enumerate(self.design.candidates)}
-        best = {self.design.candidates[k].group: int(k) for k in self.family.best}
+        known, best = self._places
         found = (known.get(c.key, best.get(c.group)) for c in chosen if c.first_order)
         own = sorted({k for k in found if k is not None})
         return self.simulated.candidate_scores[:, own], self.observed.candidate_scores[own]
+
+    @cached_property
+    def _places(self) -> tuple[dict[str, int], dict[str, int]]:
+        """Columns of the candidates by their keys, and the best ones of the groups by theirs."""
+        candidates = self.design.candidates
+        best = {candidates[k].group: int(k) for k in self.family.best}
+        return {c.key: k for k, c in enumerate(candidates)}, best
 
     def basis_group(
         self, columns: Sequence[int], others: Sequence[Candidate] = ()
