@@ -64,8 +64,7 @@ def trace(model: Model) -> Trace:
         with LOCK:
             cached = _traces.get(model)
             if cached is None or cached[0] != signature:
-                trace = _traced(model)
-                _traces[model] = cached = (model.signature, trace)
+                _traces[model] = cached = _traced(model)
     return cached[1]
 
 
@@ -73,10 +72,12 @@ class _Redefined(Exception):
     """A function turned out to be one of before, declared again: the model has changed."""
 
 
-def _traced(model: Model) -> Trace:
+def _traced(model: Model) -> tuple[tuple, Trace]:
+    """The trace, and the signature that the model had before: tracing may change what it reads."""
     while True:
+        signature = model.signature
         try:
-            return _Tracer(model).run()
+            return signature, _Tracer(model).run()
         except _Redefined:
             continue
 

@@ -71,9 +71,9 @@ def test_of_one_data_set_all_names_are_free():
 
 # -- statistics
 METHODS = {
-    ssm.MetropolisHastings(): ["lp", "log_likelihood", "acceptance_rate"],
+    ssm.MetropolisHastings(): ["lp", "log_marginal_likelihood", "acceptance_rate"],
     ssm.Gibbs(): ["lp"],
-    ssm.PMMH(particles=20, proposal="bootstrap"): ["log_likelihood"],
+    ssm.PMMH(particles=20, proposal="bootstrap"): ["log_marginal_likelihood"],
     ssm.PGAS(particles=5, proposal="bootstrap"): ["update_rate", "ess"],
 }
 
