@@ -156,7 +156,7 @@ class _Tracer:
                 if function_role in ("initial", "transition"):
                     find_root(distribution)
                 if name in sites:
-                    if self.model.forgets(function_role, givers[name], function):
+                    if self.model._forgets(function_role, givers[name], function):
                         raise _Redefined
                     raise ModelError(
                         f"{name!r} is given by two @{function_role} functions; the other is at "

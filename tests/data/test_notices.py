@@ -57,6 +57,11 @@ CASES = {
         ["the steps of the data are from 29 days to 61 days long"],
     ),
     "rows were dropped": (table().drop(index=4), ["the steps of the data are from 1 to 2 long"]),
+    "a market's days": (table(time=pd.bdate_range("2024-03-01", periods=12)), []),
+    "a day is absent": (
+        table(time=pd.date_range("2024-03-01", periods=12)).drop(index=4),
+        ["the steps of the data are from 1 day to 2 days long"],
+    ),
     "nothing in a column": (table(z=np.nan), ["z: missing in every row"]),
     "dates that nobody reads": (table(date=DATES), ["the column 'date' is not used"]),
     "dates beside others": (table(time=DATES, month=DATES), []),

@@ -54,11 +54,11 @@ class MetropolisHastings:
     covariance, scale, transform, adapt, target_acceptance : the walk, as in `PMMH`; the usual
         acceptance rates are those of Gelman, Roberts and Gilks (1996), for order 1 that of Roberts
         and Rosenthal (1998).
-    log_likelihood : whether to keep log p(y_t | y_1:t-1, theta) of each draw too, exact, in the
-        group `log_likelihood`.
     order : 0: a random walk. 1: Langevin steps along the exact gradient of the log posterior, with
         a fixed metric, the covariance (Roberts and Tweedie 1996). None: 1 where the states have no
         noise, so that the gradient costs little, and more than two numbers are free; else 0.
+    log_likelihood : whether to keep log p(y_t | y_1:t-1, theta) of each draw too, exact, in the
+        group `log_likelihood`.
     """
 
     covariance: Any = setting(None, optional(finite_matrix))  # noqa: RUF009
@@ -121,8 +121,6 @@ class PMMH:
         "natural", "log" and "reciprocal".
     adapt : whether the walk adapts during warmup; None: unless `covariance` is given. It is held
         fixed afterwards.
-    log_likelihood : whether to keep log p(y_t | y_1:t-1, theta) of each draw too, exact, in the
-        group `log_likelihood`.
     order : 0: a random walk. 1: Langevin steps along the gradient of the log posterior (PMH1 of
         Dahlin, Lindsten and Schön 2015). 2: Newton-like steps, with the observed information too
         (PMH2 there). Both are estimated by a fixed-lag smoother from the particles that give the

@@ -248,7 +248,7 @@ class Model:
         self._forget(lambda role, old, then: now.outdates(then))
         if role in ("initial", "proposal") and self.functions[role]:
             first = self.functions[role][0]
-            if not self.forgets(role, first, function, now):
+            if not self._forgets(role, first, function, now):
                 raise ModelError(
                     f"a second @{role} function; the first is at {location_of(first)}",
                     fix=f"return all states from one @{role} function; in a notebook, run the cell "
@@ -260,7 +260,7 @@ class Model:
         self._note_change(role, function)
         return function
 
-    def forgets(
+    def _forgets(
         self, role: str, old: Callable[..., Any], new: Callable[..., Any],
         now: Execution | None = None,
     ) -> bool:  # fmt: skip
