@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from ssmppl.errors import ArgumentError, listing
@@ -17,83 +17,57 @@ Kind = TypeVar("Kind", bound=type)
 
 Aliases = dict[str, tuple[str, ...]]
 
+
+def _aliases(*rows: tuple[str, str]) -> Aliases:
+    """Of rows: names, and the arguments of that meaning."""
+    return {name: tuple(meant.split()) for names, meant in rows for name in names.split()}
+
+
 # Lower case and without underscores -> arguments of that meaning, of which a callable has one.
-OF_VERBS: Aliases = {
-    **dict.fromkeys(
-        ("tune", "burn", "burnin", "nburn", "numwarmup", "nwarmup", "warm", "iterwarmup", "nadapt"),
-        ("warmup",),
-    ),
-    **dict.fromkeys(
-        (
-            "numsamples",
-            "nsamples",
-            "samples",
-            "niter",
-            "iter",
-            "iters",
-            "iterations",
-            "itersampling",
-            "ndraws",
-            "numdraws",
-            "nmcmc",
-            "size",
-            "nsim",
-            "reps",
-        ),
-        ("draws", "iterations", "trajectories", "repeats"),
-    ),
-    **dict.fromkeys(("numchains", "nchains", "chain"), ("chains",)),
-    **dict.fromkeys(("thinning", "thinby"), ("thin",)),
-    **dict.fromkeys(
-        ("randomseed", "randomstate", "rng", "rngkey", "rngseed", "prngkey", "key"), ("seed",)
-    ),
-    **dict.fromkeys(
-        ("cores", "njobs", "nproc", "workers", "parallel", "pool", "numcores", "parallelchains"),
-        ("executor",),
-    ),
-    **dict.fromkeys(("progressbar", "verbose", "disp", "quiet", "showprogress"), ("progress",)),
-    **dict.fromkeys(
-        ("initvals", "init", "inits", "initparams", "startparams", "x0", "p0", "initial"),
-        ("start",),
-    ),
-    **dict.fromkeys(("nparticles", "numparticles", "np", "n"), ("particles", "steps")),
-    **dict.fromkeys(("params", "theta", "coef", "par"), ("parameters",)),
-    **dict.fromkeys(("observed", "observations", "obs", "y", "endog", "df"), ("data",)),
-    **dict.fromkeys(("exog", "covariates", "covars", "controls"), ("inputs",)),
-    **dict.fromkeys(
-        ("nsteps", "numsteps", "nrows", "h", "nahead", "periods"), ("steps", "horizon")
-    ),
-    **dict.fromkeys(("sampler", "algorithm", "algo", "kernel", "optimizer"), ("method",)),
-    **dict.fromkeys(("targetaccept", "adaptdelta", "targetacceptprob"), ("target_acceptance",)),
-    **dict.fromkeys(("essrmin", "essmin", "essthresh"), ("ess_threshold",)),
-    **dict.fromkeys(("trace", "result", "results", "posterior"), ("idata",)),
-}
-OF_DISTRIBUTIONS: Aliases = {
-    **dict.fromkeys(("sigma", "std", "stddev", "stdev", "sd"), ("sd", "scale", "covariance")),
-    **dict.fromkeys(("var", "sigma2", "sigmasq", "variance"), ("variance", "covariance")),
-    **dict.fromkeys(
-        ("cov", "covariancematrix", "covar", "covariance", "scalematrix"),
-        ("covariance", "variance", "scale"),
-    ),
-    **dict.fromkeys(("tau", "prec", "precisionmatrix"), ("precision",)),
-    **dict.fromkeys(("chol", "scaletril", "tril", "l"), ("cholesky",)),
-    **dict.fromkeys(("mu", "location", "mean", "loc", "m"), ("mean", "loc", "rate")),
-    **dict.fromkeys(("lam", "lambda", "lmbda", "intensity"), ("rate",)),
-    **dict.fromkeys(("nu", "degreesoffreedom", "dof"), ("df",)),
-    **dict.fromkeys(("alpha", "concentration1"), ("a", "shape", "dispersion", "concentration")),
-    **dict.fromkeys(("beta", "concentration0"), ("b", "rate", "scale")),
-    **dict.fromkeys(("phi", "r", "overdispersion"), ("dispersion",)),
-    **dict.fromkeys(("concentration", "k"), ("shape", "dispersion")),
-    "kappa": ("concentration",),
-    **dict.fromkeys(("scale", "s"), ("sd",)),
-    **dict.fromkeys(("prob", "probs", "probability", "pi", "theta", "psi"), ("p", "scale")),
-    **dict.fromkeys(("totalcount", "ntrials", "trials", "size"), ("n",)),
-    **dict.fromkeys(("low", "min", "minval", "a", "left"), ("lower",)),
-    **dict.fromkeys(("high", "max", "maxval", "b", "right"), ("upper",)),
-    **dict.fromkeys(("w", "mixingprobs", "mix"), ("weights",)),
-    **dict.fromkeys(("compdists", "distributions", "dists"), ("components",)),
-    **dict.fromkeys(("dist", "distribution", "base"), ("law", "dist")),
-}
+OF_VERBS = _aliases(
+    ("tune burn burnin nburn numwarmup nwarmup warm iterwarmup nadapt", "warmup"),
+    ("numsamples nsamples samples niter iter iters iterations itersampling ndraws numdraws nmcmc",
+     "draws iterations trajectories repeats"),
+    ("size nsim reps", "draws iterations trajectories repeats"),
+    ("numchains nchains chain", "chains"),
+    ("thinning thinby", "thin"),
+    ("randomseed randomstate rng rngkey rngseed prngkey key", "seed"),
+    ("cores njobs nproc workers parallel pool numcores parallelchains", "executor"),
+    ("progressbar verbose disp quiet showprogress", "progress"),
+    ("initvals init inits initparams startparams x0 p0 initial", "start"),
+    ("nparticles numparticles np n", "particles steps"),
+    ("params theta coef par", "parameters"),
+    ("observed observations obs y endog df", "data"),
+    ("exog covariates covars controls", "inputs"),
+    ("nsteps numsteps nrows h nahead periods", "steps horizon"),
+    ("sampler algorithm algo kernel optimizer", "method"),
+    ("targetaccept adaptdelta targetacceptprob", "target_acceptance"),
+    ("essrmin essmin essthresh", "ess_threshold"),
+    ("trace result results posterior", "idata"),
+)  # fmt: skip
+OF_DISTRIBUTIONS = _aliases(
+    ("sigma std stddev stdev sd", "sd scale covariance"),
+    ("var sigma2 sigmasq variance", "variance covariance"),
+    ("cov covariancematrix covar covariance scalematrix", "covariance variance scale"),
+    ("tau prec precisionmatrix", "precision"),
+    ("chol scaletril tril l", "cholesky"),
+    ("mu location mean loc m", "mean loc rate"),
+    ("lam lambda lmbda intensity", "rate"),
+    ("nu degreesoffreedom dof", "df"),
+    ("alpha concentration1", "a shape dispersion concentration"),
+    ("beta concentration0", "b rate scale"),
+    ("phi r overdispersion", "dispersion"),
+    ("concentration k", "shape dispersion"),
+    ("kappa", "concentration"),
+    ("scale s", "sd"),
+    ("prob probs probability pi theta psi", "p scale"),
+    ("totalcount ntrials trials size", "n"),
+    ("low min minval a left", "lower"),
+    ("high max maxval b right", "upper"),
+    ("w mixingprobs mix", "weights"),
+    ("compdists distributions dists", "components"),
+    ("dist distribution base", "law dist"),
+)
 
 
 def called_here(name: str, own: Sequence[str], aliases: Aliases) -> str:
@@ -146,17 +120,13 @@ def _check(
         signature.bind(*args, **kwargs)
     except TypeError as error:
         own = list(signature.parameters)
-        unknown = _unknown(kwargs, own)
+        unknown = next((n for n in kwargs if n not in own), "")
         if unknown:
             raise ArgumentError(
                 f"{name} has no argument {unknown!r}", fix=hint(unknown, own, name, OF_VERBS)
             ) from None
         called = ", ".join(_written(p) for p in signature.parameters.values())
         raise ArgumentError(f"{name}: {error}", fix=f"write {name}({called})") from None
-
-
-def _unknown(given: Iterable[str], own: Sequence[str]) -> str:
-    return next((n for n in given if n not in own), "")
 
 
 def _written(parameter: inspect.Parameter) -> str:

@@ -136,17 +136,18 @@ _LIBRARIES = tuple(
         sysconfig.get_path("platlib"), sysconfig.get_path("purelib"),
     )
 )  # fmt: skip
-_warned: dict[Any, Any] = {}
 
 
 def warn(text: str) -> None:
     """Give a warning at the line of the user's that it is about: the innermost that is neither of
-    this package nor of a library."""
+    this package nor of a library. It is shown once a line, in a notebook once a run of its cell, as
+    `warnings.warn` would there."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_LIBRARIES):
         frame = frame.f_back
+    shown = frame.f_globals.setdefault("__warningregistry__", {})
     file, line = frame.f_code.co_filename, frame.f_lineno
-    warnings.warn_explicit(text, UserWarning, file, line, registry=_warned)
+    warnings.warn_explicit(text, UserWarning, file, line, registry=shown)
 
 
 @dataclass(frozen=True)

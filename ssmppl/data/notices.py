@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from ssmppl.data.binding import Experiment, unread
 from ssmppl.data.times import spacing
 from ssmppl.errors import warn
+from ssmppl.language.checks.ranges import beyond_range
 from ssmppl.language.model.trace import Trace
 
 LEAST_DAYS = 10  # rows from which a week has shown
@@ -19,10 +22,27 @@ OF_TIME = re.compile(
 )
 
 
+_noticed: ContextVar[bool] = ContextVar("noticed", default=False)
+
+
+@contextmanager
+def noticed() -> Iterator[None]:
+    """Within the block nothing is noticed: a verb has done so that calls others, with parts of the
+    data."""
+    token = _noticed.set(True)
+    try:
+        yield
+    finally:
+        _noticed.reset(token)
+
+
 def warn_of(trace: Trace, data: Any, experiments: Sequence[Experiment]) -> None:
     """Warn of rows that seem to be absent, of columns that hold nothing, and of times that nobody
-    reads."""
-    for text in (*_steps(trace, experiments), *_empty(trace, experiments)):
+    reads; and of priors that go beyond what their parameters may be."""
+    if _noticed.get():
+        return
+    found = (*_steps(trace, experiments), *_empty(trace, experiments), *beyond_range(trace))
+    for text in found:
         warn(text)
     if all(e.time is None for e in experiments):
         for column in filter(OF_TIME.fullmatch, unread(trace, data)):

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 import ssmppl as ssm
-from ssmppl.errors import _warned
 
 DATES = pd.date_range("2020-01-01", periods=12, freq="MS")
 Y = np.cumsum(np.random.default_rng(1).normal(size=12))
@@ -40,9 +39,8 @@ def table(**columns):
 
 
 def said(model, data, verb=ssm.maximize):
-    _warned.clear()
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("default")
+        warnings.simplefilter("always")
         verb(model, data, progress=False)
     for w in caught:
         assert w.filename == __file__  # the user's own line
@@ -86,3 +84,20 @@ def test_sampling_notices_too():
         return ssm.sample(model, data, draws=4, warmup=4, chains=1, seed=1, progress=progress)
 
     assert len(said(level(), table(date=DATES), short)) == 1
+
+
+def test_a_verb_that_samples_from_parts_of_the_data_notices_once():
+    """A channel that begins late is missing in all rows of the first part."""
+
+    def shortly(model, data, progress):
+        ssm.leave_future_out(
+            model, data, first=6, draws=20, warmup=20, chains=2, seed=1, progress=progress
+        )
+
+    def evidence(model, data, progress):
+        ssm.evidence(model, data, draws=100, warmup=50, chains=2, seed=1, progress=progress)
+
+    late = table(z=np.where(np.arange(12) < 8, np.nan, Y))
+    assert [s for s in said(level(), late, shortly) if "missing in every row" in s] == []
+    found = said(level(), table(date=DATES), evidence)
+    assert len([s for s in found if "the column 'date'" in s]) == 1

@@ -17,8 +17,7 @@ from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
 from ssmppl.codegen.modules.program import OWN_MODULES, Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.data.notices import warn_of
-from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing, warn
-from ssmppl.language.checks.ranges import beyond_range
+from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.tracing import trace
@@ -146,6 +145,4 @@ def pose(model: Model, data: Any, *, noting: bool = False) -> Problem:
     experiments = tuple(bind(traced, data))
     if noting:
         warn_of(traced, data, experiments)
-        for text in beyond_range(traced):
-            warn(text)
     return Problem(traced, experiments, compile_trace(traced, missing_of(experiments)))

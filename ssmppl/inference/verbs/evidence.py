@@ -22,6 +22,7 @@ from ssmppl.analysis.density import terms
 from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_values
+from ssmppl.data.notices import noticed
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
@@ -160,10 +161,11 @@ def evidence(
             f"too few to fit a distribution of {d} number{'s' if d > 1 else ''} to",
             fix=f"give at least {-(-2 * POINTS * (d + 1) // chains)} draws",
         )
-    result = sample(
-        model, data, chosen, draws=draws, warmup=warmup, chains=chains, start=start, fixed=fixed,
-        states=False, seed=seed, executor=executor, progress=progress,
-    )  # fmt: skip
+    with noticed():
+        result = sample(
+            model, data, chosen, draws=draws, warmup=warmup, chains=chains, start=start,
+            fixed=fixed, states=False, seed=seed, executor=executor, progress=progress,
+        )  # fmt: skip
     interrupted = bool(result["posterior"].attrs["interrupted"])
     z, own = _posterior(space, result)
     if interrupted and z.shape[1] < FEW:
@@ -291,10 +293,8 @@ def _without_parameters(
 def _posterior(space: Space, result: Any) -> tuple[np.ndarray, np.ndarray]:
     """z (chains, draws, free) and log p(y | theta) + log prior + log Jacobian at each."""
     trace = space.problem.trace
-    posterior, likelihood = (
-        result["posterior"],
-        result["sample_stats"]["log_marginal_likelihood"].values,
-    )
+    posterior = result["posterior"]
+    likelihood = result["sample_stats"]["log_marginal_likelihood"].values
     fixed = dict(zip(trace.parameter_symbols, space.theta, strict=True))
     z = np.empty((*likelihood.shape, len(space.positions)))
     total = likelihood.astype(float).copy()

@@ -28,6 +28,7 @@ from ssmppl.arguments import checked
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, OK
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment
+from ssmppl.data.notices import noticed
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.methods.methods import Method
 from ssmppl.inference.particles.filtering import FilterSettings, failure
@@ -140,7 +141,8 @@ def leave_future_out(
             log_w, shape = _smoothed(increments[:, since:t].sum(axis=1))
             fresh = not shape <= threshold  # NaN is none to trust
         if fresh:
-            idata = sample(model, _until(whole, t), seed=_number(seeds, refits), **settings)
+            with noticed():  # of the rows before t a channel may have none
+                idata = sample(model, _until(whole, t), seed=_number(seeds, refits), **settings)
             posterior = posterior_of(idata)
             if posterior.attrs["interrupted"]:  # a part of its draws, where nobody asked for it
                 raise KeyboardInterrupt

@@ -75,6 +75,6 @@ def _cell(shell: Any) -> str | None:
     ask = getattr(shell, "get_parent", None)
     try:
         found = ask()["metadata"]["cellId"] if callable(ask) else None
-    except (KeyError, TypeError, LookupError):
+    except (LookupError, TypeError):
         return None
     return None if found is None else f"cell {found}"
