@@ -1,7 +1,7 @@
 """What a two-link arm in MuJoCo lacks, by `ssm.diagnose` on records of arms that have more.
 
     python bench/arm_effects.py [--kinds friction stop delay drag none] [--seeds 1 2 3 4 5]
-        [--rows 500] [--mode full] [--processes 2]
+        [--rows 500] [--mode full] [--processes 2] [--only-sysid]
 
 The real arm is the model's file with one thing more, which the diagnosis is not told: dry friction
 in the elbow (`frictionloss`), a stop at 65 degrees either way, motors that act four rows late, a
@@ -9,7 +9,7 @@ quadratic drag of the elbow, or nothing. Records have torques that are sums of s
 speeds, encoders with 2 mrad of noise, ten steps of the engine a row. Right is an effect of that
 kind first, in the elbow (of the delay: in one of the inputs); of nothing, that no effect is named.
 Beside it `mujoco.sysid` (extra `mujoco[sysid]`) fits its three parameters to the same record: what
-it makes of what is missing.
+it makes of what is missing; `--only-sysid` prints that alone, as means and spreads over the seeds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import importlib.util
 import logging
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -111,6 +111,16 @@ def sysid(data: Mapping[str, np.ndarray]) -> str:
     return ", ".join(f"{n} {v:.3f}" for n, v in found.items())
 
 
+def damped(kinds: Sequence[str], seeds: Sequence[int], rows: int) -> None:
+    """What `mujoco.sysid` makes of what is missing, over the seeds."""
+    lines = []
+    for kind in kinds:
+        found = [by_sysid(record(kind, rows, seed))[0] for seed in seeds]
+        each = [np.array([f[n] for f in found]) for n in found[0]]
+        lines.append([kind, *(f"{v.mean():.3f} ± {v.std(ddof=1):.3f}" for v in each)])
+    show(["missing", *found[0]], lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
@@ -118,8 +128,12 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=500)
     parser.add_argument("--mode", default="full", choices=("fast", "full"))
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--only-sysid", action="store_true")
     options = parser.parse_args()
     logging.getLogger("absl").setLevel(logging.ERROR)
+    if options.only_sysid:
+        damped(options.kinds, options.seeds, options.rows)
+        return
     arm, rows = model(XML, 1), []
     for seed in options.seeds:
         for kind in options.kinds:

@@ -18,7 +18,7 @@ error of simulations over the default horizon on rows not used, before and after
 
 The model that `multisine` gives back is also compared with the linear one on the part of the
 Silverbox's record with growing amplitude, by the error of a simulation that never looks at the
-answers.
+answers; that of `emps` by windows of half a second of its other record, from filtered states.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,13 +41,19 @@ from scipy.io import loadmat
 
 import ssmppl as ssm
 from bench.gap.real.answers import Absent, Named, Right, grade, named
+from ssmppl.diagnosis.fitting.augmented_models import proposal_of
+from ssmppl.diagnosis.fitting.fit import Fitter
+from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report import words
 from ssmppl.diagnosis.report.report import GapReport
+from ssmppl.diagnosis.selection.horizons import look_ahead
+from ssmppl.inference.run.problem import pose
 from ssmppl.modelfile import load_model
 
 HERE = Path(__file__).parent
 PACKAGED = ("measles", "hare_lynx", "beaver", "nile", "house", "cooling_water", "electricity",
             "power_plant")  # fmt: skip
+WINDOW, PARTICLES = 25, 100  # rows of the servo's windows, half a second; as in full mode
 MULTISINE, GROWING = slice(45_000, 46_000), slice(100, 40_575)  # rows of the Silverbox
 COLUMNS = ("case", "rows", "known", "headline", "before", "after", "horizon", "grade", "seconds")
 
@@ -198,6 +205,34 @@ def checked(model: ssm.Model, report: GapReport, data: pd.DataFrame) -> None:
               f"by tenths of the rows {', '.join(f'{1e3 * e:.2f}' for e in tenths)}")  # fmt: skip
 
 
+def windows_ahead(model: ssm.Model, values: Mapping[str, float], data: pd.DataFrame) -> float:
+    """Root mean square error of y over `WINDOW` rows, simulated from the filtered states of rows
+    spread over the data."""
+    problem = pose(model, data)
+    names = [repr(s) for s in problem.trace.parameter_symbols]
+    fixed = {n: np.asarray(values[n]) for n in names}
+    settings = Settings(PARTICLES, proposal_of(problem.program))
+    fitter = Fitter(problem, fixed, settings)
+    theta = np.array([float(values[n]) for n in names])
+    everything = [np.ones(e.steps, dtype=bool) for e in problem.experiments]
+    found = look_ahead(
+        fitter, SimpleNamespace(theta=theta), problem.experiments, everything, WINDOW,
+        np.random.SeedSequence(1),
+    )  # fmt: skip
+    return found.window(WINDOW).rmse
+
+
+def validated(model: ssm.Model, report: GapReport, folder: Path) -> None:
+    """Half-second windows of the servo's other record, by each set of parameters."""
+    data = pd.read_csv(folder / "validation.csv")
+    print(f"\nThe other record, {len(data):,} rows, windows of {WINDOW} rows:")
+    for when in report.estimates:
+        own = model if when == "before" else report.model
+        if own is not None:
+            error = 1e3 * windows_ahead(own, fitted(report, when), data)
+            print(f"  {when}: off by {error:.2f} mm rms")
+
+
 def diagnosed(name: str, case: Case, options: argparse.Namespace) -> dict[str, Any]:
     """The line of one case; its report is printed and saved."""
     data = case.records()
@@ -210,6 +245,8 @@ def diagnosed(name: str, case: Case, options: argparse.Namespace) -> dict[str, A
         traceback.print_exc()
         return {"case": name, "rows": len(data), "known": case.lacks, "headline": "an error",
                 "grade": "error"}  # fmt: skip
+    if name == "emps" and options.mode == "full":
+        validated(model, report, options.shared / "cases" / "emps")
     if name == "multisine" and options.mode == "full":
         checked(model, report, silverbox(options.shared / "data"))
     return line(name, case, len(data), report)

@@ -75,7 +75,7 @@ def fit_for_simulation(
     tried = [SimulationFit(fitter, fit, 1.0, of_base.mean_squares(fitter, fit, train))]
     # Where a simulator is called each fit takes long.
     called = isinstance(fitter.smoother.extended, Extended)
-    names, last = [] if called else _scales(fitter), fit
+    names, last = [] if called else process_noises(fitter), fit
     for share in SHARES if names else ():
         quiet = fitter.with_fixed({n: share * fit.by_parameter[n] for n in names})
         start = {n: v for n, v in last.by_parameter.items() if n not in names}
@@ -121,7 +121,7 @@ def _of_means(fitter: Fitter) -> set[str]:
     return {s.data[1] for s in symbols_of([*means.values()]) if s.data[0] == "parameter"}
 
 
-def _scales(fitter: Fitter) -> list[str]:
+def process_noises(fitter: Fitter) -> list[str]:
     """Parameters that scale the noise of transitions and do nothing else after the first row."""
     trace = fitter.problem.trace
     laws = [e for s in trace.observations.values() for e in s.distribution.expressions()]

@@ -250,7 +250,7 @@ def test_the_share_that_gains_most_ranks_and_the_one_with_the_least_error_simula
 
 def test_only_what_scales_the_noise_is_held(spring_fit):
     augmented, _, _ = spring_fit
-    assert simulation_fit._scales(augmented.base_fitter) == ["q"]
+    assert simulation_fit.process_noises(augmented.base_fitter) == ["q"]
     model = ssm.Model("walk whose mean depends on its noise")
     model.prior(lambda: {"q": ssm.HalfNormal(sd=1.0)})
     model.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
@@ -258,7 +258,7 @@ def test_only_what_scales_the_noise_is_held(spring_fit):
     model.observation(lambda x: {"y": ssm.Normal(x, sd=0.1)})
     problem = pose(model, {"y": np.arange(20.0)})
     other = AugmentedModels(problem.trace, missing_of(problem.experiments), {}, Settings())
-    assert simulation_fit._scales(other.base_fitter) == []
+    assert simulation_fit.process_noises(other.base_fitter) == []
 
 
 def test_a_fault_of_a_fit_leaves_the_one_of_the_likelihood(spring_fit, monkeypatch):
