@@ -23,12 +23,6 @@ exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 # Under another backend than the notebooks' own their figures would not be on the pages.
 os.environ.pop("MPLBACKEND", None)
 
-# Pages draw few, to be built in minutes: what that does to R-hat and effective sizes stands in
-# their tables, and `read_diagnostics` shows the warning that it gives.
-os.environ["PYTHONWARNINGS"] = (
-    "ignore:the chains have not mixed,ignore:effective sample size too small"
-)
-
 # Notebooks are Markdown files. All are run anew for every build; an error in one fails it.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

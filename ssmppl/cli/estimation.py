@@ -135,7 +135,7 @@ def sample(
         stop_interrupted(f"{kept} of {draws} draws of each chain are kept.{further}")
 
 
-@command("summary", "The parameters of a posterior, and how they mixed.")
+@command("summary", "The parameters of a posterior, and whether the chains converged.")
 @POSTERIOR
 @option("--var-names", type=Names(), metavar="NAME,NAME...", section="Model and data",
         help="Of these variables [default: all parameters].")  # fmt: skip
@@ -146,7 +146,7 @@ def summary(
     """The parameters of POSTERIOR.nc, a file that `ssmppl sample` wrote.
 
     Prints mean, standard deviation, their Monte Carlo errors, bulk and tail effective sample size
-    and R-hat of each number, and marks those that have not mixed. Writes the table only where -o
+    and R-hat of each number, and marks those whose chains have not converged. Writes the table only where -o
     says where.
 
     \b

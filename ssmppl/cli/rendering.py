@@ -20,6 +20,7 @@ import numpy as np
 from ssmppl.cli.group import AS_JSON, IN_PART, INTERRUPTED
 from ssmppl.cli.reading import NETCDF, PARQUET, TABLES, has_posterior, pyarrow
 from ssmppl.errors import ArgumentError
+from ssmppl.inference.run.convergence import ESS, R_HAT
 from ssmppl.results import save
 from ssmppl.tables import component_label, quantiles_of, state_table, summary_text
 
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 SHOWN_ROWS = 10
 LEVELS = (0.05, 0.5, 0.95)  # of the quantiles that are printed
-HIGH_R_HAT, LOW_ESS = 1.01, 400  # Vehtari, Gelman, Simpson, Carpenter and Bürkner (2021)
 
 
 # -- saying
@@ -174,21 +174,21 @@ def fitting_rows(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def summary_lines(table: pd.DataFrame) -> str:
-    """A summary as text, its rows that have not mixed marked, with a note on them."""
+    """A summary as text, its rows whose chains have not converged marked, with a note on them."""
     head, *lines = summary_text(table).split("\n")
     if table.empty:
         return head
-    apart = (table["r_hat"] > HIGH_R_HAT).to_numpy()
-    few = (table[["ess_bulk", "ess_tail"]].min(axis=1) < LOW_ESS).to_numpy()
+    apart = (table["r_hat"] >= R_HAT).to_numpy()
+    few = (table[["ess_bulk", "ess_tail"]].min(axis=1) < ESS).to_numpy()
     shown = [
         click.style(line, fg="red" if a else "yellow") if a or f else line
         for line, a, f in zip(lines, apart, few, strict=True)
     ]
     notes = []
     if apart.any():
-        notes.append(f"r_hat above {HIGH_R_HAT}: the chains have not converged, draw more")
+        notes.append(f"r_hat not below {R_HAT:g}: the chains have not converged, draw more")
     if few.any():
-        notes.append(f"ess below {LOW_ESS}: Monte Carlo error is large, draw more or thin more")
+        notes.append(f"ess below {ESS:g}: Monte Carlo error is large, draw more")
     text = "\n".join([click.style(head, bold=True), *shown])
     return text + "".join(f"\nNote: {one}." for one in notes)
 

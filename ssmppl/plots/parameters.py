@@ -52,7 +52,7 @@ def plot_prior_posterior(
 ) -> Any:
     """The density of each parameter before and after the data: prior dashed, posterior filled.
 
-    Thin lines are single chains; where they differ from the whole, the chains have not mixed. A
+    Thin lines are single chains; where they differ from the whole, the chains have not converged. A
     posterior like its prior has learned nothing from the data. The prior is drawn over the range of
     the posterior, so that a vague one is a low line.
 

@@ -118,7 +118,7 @@ def test_rows_are_marked_by_how_they_mixed(posterior, monkeypatch):
     assert YELLOW not in good + apart
     assert "Note" not in good
     assert f"{RED}q " in apart
-    assert "r_hat above 1.01" in apart
+    assert "r_hat not below 1.01" in apart
     assert f"{YELLOW}q " in few
 
 

@@ -31,7 +31,9 @@ DrawnChains = Sequence[ChainDraws[Any]]
 Drawn = tuple[list[ChainDraws[Any]], dict[str, Any]]  # the chains, and what to report of them
 PlanRows = list[tuple[str, str]]
 
-GO_ON = (2, 4)  # times the draws that were asked for, to which chains go on that have not mixed
+# Times the draws that were asked for, to which chains go on that have not converged: one more for
+# a longer warmup, which the first ones then are, and the others for larger effective sample sizes.
+GO_ON = (2, 3, 5, 9)
 
 # Titles of what `explain` says of the methods.
 TRAJECTORIES = "Trajectories"
@@ -135,12 +137,13 @@ class SamplingMethod:
 
     def draw(
         self, setup: SamplingSetup, settings: Any, draws: int, executor: Executor | None,
-        progress: bool, mixed: Callable[[DrawnChains], bool] | None = None,
+        progress: bool, converged: Callable[[DrawnChains], bool] | None = None,
+        go_on: Sequence[int] = GO_ON,
     ) -> Drawn:  # fmt: skip
         """The chains, and what to report of them.
 
-        mixed : whether they have; where they have not they go on, as `GO_ON` says. None: they are
-        left as they are.
+        converged : whether they have; where they have not they go on, to so many times the draws,
+        of which the first ones then count as warmup. None: they are left as they are.
         """
         if self.prepare is None:
             assert self.independent is not None
@@ -148,8 +151,9 @@ class SamplingMethod:
         title, checkpoint = type(settings).__name__, setup.checkpoint
         chains: PreparedChains | None = None
         result: list[ChainDraws[Any]] = []
-        for times in (1, *GO_ON):
-            if times > 1 and (mixed is None or result[0].interrupted or mixed(result)):
+        for times in (1, *go_on):
+            kept = [_as_asked(c, draws) for c in result]
+            if kept and (converged is None or kept[0].interrupted or converged(kept)):
                 break
             done = len(result[0].draws["theta"]) if result else 0
             if chains is None and not _on_file(checkpoint, setup.warmup + times * draws):
@@ -181,14 +185,19 @@ class SamplingMethod:
         total = len(result[0].draws["theta"])
         if total > draws:
             report = {**report, "further_draws": total - draws}
-            result = [c.latter_half(draws) for c in result]
-        return result, report
+        return [_as_asked(c, draws) for c in result], report
 
     def advice(self, settings: Any) -> str:
         """What to try, besides more draws, where parameters mix slowly."""
         if getattr(settings, "interweave", "auto") is False:
             return f', or ssm.{type(settings).__name__}(interweave="auto")'
         return self.where_slow
+
+
+def _as_asked(chain: ChainDraws[Any], draws: int) -> ChainDraws[Any]:
+    """A chain that may have gone on, with as many draws as were asked for."""
+    more = len(chain.draws["theta"]) > draws
+    return chain.without_first(draws) if more else chain
 
 
 def _on_file(checkpoint: Checkpoint | None, draws: int) -> bool:

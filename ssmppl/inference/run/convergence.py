@@ -1,10 +1,11 @@
-"""Whether chains have mixed, parameters and trajectories, and a warning where they have not.
+"""Whether chains have converged, parameters and trajectories, and a warning where they have not.
 
 Parameters: A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner, "Rank-normalization,
 folding, and localization: an improved R-hat for assessing convergence of MCMC", *Bayesian Analysis*
 16 (2021): R-hat of split chains, equations (1) to (4), of the ranks and of those of distances from
-the median (section 4.2), and the effective sample size of the ranks (section 4.1 with equations (8)
-to (11)).
+the median (section 4.2); the effective sample size of the ranks (section 4.1 with equations (8) to
+(11)) and the lesser one of the 5% and 95% quantiles (section 4.3). The rule is theirs, and the same
+for warnings, for chains that go on by themselves, for the command line and in the docs.
 
 Trajectories: particle Gibbs leaves the right distribution invariant whatever its update rate, but a
 row that never changes has not been sampled: paths of a conditional particle filter meet in the
@@ -27,11 +28,9 @@ from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.trace import Site
 
-APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
-FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
-MET, ENOUGH = 1.01, 400.0  # R-hat and ESS that the first paper recommends, in its section 4
-FOR_THAT = 4000  # draws of all chains, as by default, from which chains are to come to them
+R_HAT, ESS = 1.01, 400.0  # below, at least: what the first paper recommends, in its section 4
 LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can be estimated
+DIFFERENT_PLACES = 1.1  # R-hat from which longer chains are no remedy by themselves
 LOW = 0.02  # share of draws at which a row changes, below which there is a warning
 STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
 Paths = tuple[np.ndarray, ...]
@@ -39,7 +38,7 @@ PIECE = 2**25  # bytes of draws that are looked at together
 FEWEST_FOR_RATES = 50  # draws of a chain from which rates are worth a warning
 
 
-def mixing_attributes(
+def convergence_attributes(
     labels: list[str], draws: np.ndarray, interrupted: bool, advice: str, warmup: int
 ) -> dict[str, str]:
     """What goes to the attributes: nothing, or the warning, which is also given.
@@ -49,40 +48,72 @@ def mixing_attributes(
     besides more draws.
     """
     chains, n, _ = draws.shape
-    if interrupted or chains < LEAST_CHAINS or n < FEWEST or not labels:
+    if interrupted or n < FEWEST or not labels:
         return {}
-    found = np.array([(rank_r_hat(c), bulk_ess(c)) for c in np.moveaxis(draws, 2, 0)])
-    r_hat, ess = np.where(np.isnan(found), [1.0, np.inf], found).T  # NaN: a constant
-    bad = (r_hat > APART) | (ess < FEW)
-    if not bad.any():
-        return {}
-    apart = bool((r_hat > APART).any())
-    worst = int(np.argmax(r_hat) if apart else np.argmin(ess))
-    others = int(bad.sum()) - 1
-    text = (
-        ("the chains have not mixed" if apart else "effective sample size too small")
-        + f": R-hat of {labels[worst]} is {r_hat[worst]:.3g}, its bulk ESS {ess[worst]:.3g}"
-        + (f"; {others} other parameters also fail" if others > 1 else "")
-        + ("; 1 other parameter also fails" if others == 1 else "")
-        + f". R-hat has to be below {APART:g} and the ESS at least {FEW:g} before means and "
-        f"intervals are used. Take more draws (there were {n} of each chain) and warmup ({warmup})"
-        + advice
-    )
+    if chains < LEAST_CHAINS:
+        text = (
+            "one chain has no R-hat: nothing tells whether it has converged. Take several "
+            "(chains=4 is the default)"
+        )
+    else:
+        found = np.array([diagnostics(c) for c in np.moveaxis(draws, 2, 0)])
+        bad = fall_short(found)
+        if not bad.any():
+            return {}
+        text = _how_far(labels, found, bad) + _remedy(found[bad], n, warmup) + advice
     warn(text)
-    return {"mixing_warning": text}
+    return {"convergence_warning": text}
 
 
-def have_mixed(chains: Sequence[ChainDraws[Any]], free: np.ndarray) -> bool:
-    """Whether the parameters that are free (P,) have what is recommended of R-hat and ESS; in runs
-    of fewer than `FOR_THAT` draws, whether there is nothing to warn of."""
+def _how_far(labels: list[str], found: np.ndarray, bad: np.ndarray) -> str:
+    """The worst component by its figures, and how many others fall short."""
+    worst = int(np.argmax(np.where(bad, _times(found), 0.0)))
+    r_hat, bulk, tail = found[worst]
+    others = int(bad.sum()) - 1
+    more = f"; {others} other parameter{'s fall' if others > 1 else ' falls'} short too"
+    return (
+        f"the chains have not converged: R-hat of {labels[worst]} is {r_hat:.4g} (below {R_HAT:g} "
+        f"is needed), its bulk ESS {bulk:.3g} and its tail ESS {tail:.3g} (at least {ESS:g} of "
+        f"each){more if others else ''}. "
+    )
+
+
+def _remedy(found: np.ndarray, n: int, warmup: int) -> str:
+    """What to do about components (P, 3) that fall short, of chains of n draws."""
+    if found[:, 0].max() > DIFFERENT_PLACES:
+        return f"They are in different places: take a longer warmup (it was {warmup})"
+    wanted = _times(found).max() * n
+    unit = 10 ** max(int(np.log10(wanted)) - 1, 0)
+    return (
+        f"About draws={unit * int(np.ceil(wanted / unit))} of each chain would do at this rate "
+        f"(there were {n})"
+    )
+
+
+def _times(found: np.ndarray) -> np.ndarray:
+    """How many times as many draws components (P, 3) need: R-hat of chains in one place is above 1
+    by a multiple of 1/n, and effective sample sizes grow with n."""
+    with np.errstate(divide="ignore"):
+        return np.max([(found[:, 0] - 1.0) / (R_HAT - 1.0), *(ESS / found[:, 1:]).T], axis=0)
+
+
+def have_converged(chains: Sequence[ChainDraws[Any]], free: np.ndarray) -> bool:
+    """Whether the parameters that are free (P,) meet the rule; of what it cannot be told, True."""
     draws = np.stack([c.draws["theta"] for c in chains])[:, :, free]
-    if len(chains) < LEAST_CHAINS or draws.shape[1] < FEWEST or not draws.shape[2]:
+    if len(chains) < LEAST_CHAINS or draws.shape[1] < FEWEST:
         return True
-    r_hat, ess = (MET, ENOUGH) if draws[:, :, 0].size >= FOR_THAT else (APART, FEW)
-    for component in np.moveaxis(draws, 2, 0):
-        if rank_r_hat(component) > r_hat or bulk_ess(component) < ess:
-            return False
-    return True
+    return not any(fall_short(diagnostics(c)[None])[0] for c in np.moveaxis(draws, 2, 0))
+
+
+def fall_short(found: np.ndarray) -> np.ndarray:
+    """Which components (P,) miss the rule, by their R-hat, bulk and tail ESS (P, 3)."""
+    return (found[:, 0] >= R_HAT) | (found[:, 1:] < ESS).any(axis=1)
+
+
+def diagnostics(draws: np.ndarray) -> np.ndarray:
+    """R-hat, bulk and tail ESS (3,) of draws (chains, n); of a constant 1 and infinite."""
+    found = np.array([rank_r_hat(draws), bulk_ess(draws), tail_ess(draws)])
+    return np.where(np.isnan(found), [1.0, np.inf, np.inf], found)
 
 
 def rank_r_hat(draws: np.ndarray) -> float:
@@ -92,12 +123,24 @@ def rank_r_hat(draws: np.ndarray) -> float:
 
 
 def bulk_ess(draws: np.ndarray) -> float:
-    """Effective sample size of the ranks of split chains, draws (chains, n).
+    """Effective sample size of the ranks of split chains, draws (chains, n)."""
+    return _ess(_ranked(_split(draws)))
+
+
+def tail_ess(draws: np.ndarray) -> float:
+    """The lesser effective sample size of the 5% and the 95% quantile, draws (chains, n); NaN
+    where all draws are equal."""
+    quantiles = np.quantile(draws, [0.05, 0.95])
+    sizes = [_ess(_split(draws <= q).astype(float)) for q in quantiles]
+    return float(np.nanmin(sizes)) if not np.isnan(sizes).all() else np.nan
+
+
+def _ess(z: np.ndarray) -> float:
+    """Effective sample size of chains (m, n) for their mean; NaN where nothing varies.
 
     Autocorrelations are summed up to where Geyer's pairs of them turn negative, made to fall
     (Geyer 1992, "Practical Markov chain Monte Carlo").
     """
-    z = _ranked(_split(draws))
     chains, n = z.shape
     centred = z - z.mean(axis=1, keepdims=True)
     size = 1 << (2 * n - 1).bit_length()

@@ -60,13 +60,14 @@ class ChainDraws(Generic[State]):
         draws, stats = joined([self.draws, later.draws]), joined([self.stats, later.stats])
         return replace(later, draws=draws, stats=stats, warmup_stats=self.warmup_stats)
 
-    def latter_half(self, most: int) -> ChainDraws[State]:
-        """Without its first half, the rest thinned to at most so many draws."""
+    def without_first(self, draws: int) -> ChainDraws[State]:
+        """Its first draws count as warmup, the rest is thinned to as many. A chain of fewer than
+        twice so many has no more than its last ones."""
         n = len(next(iter(self.draws.values())))
-        left = max(n // 2, min(most, n))
-        own = slice(n - left, None, max(left // most, 1))
-        draws, stats = ({k: v[own][:most] for k, v in d.items()} for d in (self.draws, self.stats))
-        return replace(self, draws=draws, stats=stats)
+        left = max(n - draws, min(draws, n))
+        own = slice(n - left, None, max(left // draws, 1))
+        kept, stats = ({k: v[own][:draws] for k, v in d.items()} for d in (self.draws, self.stats))
+        return replace(self, draws=kept, stats=stats)
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.gaussian_pilot import approximation_kind, precise_twisted
 from ssmppl.inference.preparation.method_choice import choose_sampler, only_counts, why_stuck
 from ssmppl.inference.preparation.space import Space, free_components, space_of
-from ssmppl.inference.run.convergence import have_mixed, mixing_attributes
+from ssmppl.inference.run.convergence import ESS, convergence_attributes, have_converged
 from ssmppl.inference.run.draws import stack
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import Labels, check_names, model_attributes, observes
@@ -51,6 +51,9 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.transforms import transforms
 from ssmppl.results import to_inference_data
 
+# Draws of all chains without which these do not go on: what is left of them when they are thinned
+# has an ESS of 400 for certain only if there is room.
+LEAST_TO_GO_ON = 2 * ESS
 TRIED_OUT = 4  # draws, and as many before them
 FEW_SETS = 2  # what passes over several data sets need is compiled for two as for any number
 # The methods, under the classes of their settings.
@@ -99,10 +102,9 @@ def sample(
         with up to 12 free numbers; else PGAS, likewise with `interweave="auto"`, or PMMH where no
         ancestors can be sampled, the data are long or the states counts, and the parameters are
         few. `explain` and the attributes say which, and why. Chains of a method that was chosen
-        like this and have not mixed (R-hat above 1.01 or a bulk ESS below 400, where there are 4000
-        draws of all chains; 1.05 and 100 of fewer) go on to twice and, if need be, four times the
-        draws, of which the first half then counts as warmup and the second is thinned to as many
-        draws as were asked for; the attribute `further_draws` says how many were made.
+        like this, 800 draws of all or more, go on until they have converged (see the attributes
+        below): to at most nine times the draws. The first then count as warmup, and the others are
+        thinned to as many as were asked for; the attribute `further_draws` says how many were made.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
         warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
@@ -145,8 +147,9 @@ def sample(
         Attributes name method, settings, seed, versions, the plan, and the time taken; after PGAS
         also trajectory_update_rate, the least share of draws between which a row of the trajectory
         changed, and where rows hardly do trajectory_warning, which is given as a warning too. So is
-        mixing_warning, where R-hat of some parameter is above 1.05 or its bulk ESS below 100; never
-        of one chain, of fewer than 100 draws of each, of SMC2 or of an interrupted run.
+        convergence_warning, unless R-hat of every parameter is below 1.01 and its bulk and tail ESS
+        over all chains at least 400 (of one chain: that it has no R-hat); never of fewer than 100
+        draws of each chain, of SMC2 or of an interrupted run.
         Ctrl-C returns what was drawn, with the attribute `interrupted`.
 
     Raises
@@ -203,9 +206,12 @@ def sample(
         problem, space, fixed_values, chains, warmup, thin, root, states, checkpoint_file
     )
     free = free_components(problem.trace, fixed_values)
-    patience = _room_to_go_on(problem, sampling_method, chosen, chains, draws, states)
-    mixed = partial(have_mixed, free=free) if method is None and patience else None
-    result, report = sampling_method.draw(setup, chosen, draws, executor, progress, mixed)
+    by_row = sampling_method.by_row(chosen)
+    go_on = [k for k in GO_ON if _room_for(problem, by_row, chains, k * draws, states)]
+    enough = method is None and chains * draws >= LEAST_TO_GO_ON
+    converged = partial(have_converged, free=free) if enough else None
+    drawn = sampling_method.draw(setup, chosen, draws, executor, progress, converged, go_on)
+    result, report = drawn
     attrs = {
         **model_attributes(problem.trace),
         "method": type(chosen).__name__,
@@ -225,7 +231,7 @@ def sample(
     if sampling_method.markov:
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
         theta, interrupted = whole[0]["theta"][:, :, free], bool(attrs["interrupted"])
-        attrs |= mixing_attributes(
+        attrs |= convergence_attributes(
             labels, theta, interrupted, sampling_method.advice(chosen), warmup
         )
     return _to_arviz(problem, whole, fixed_values, states, attrs)
@@ -251,14 +257,10 @@ def _check_room(problem: Problem, by_row: bool, chains: int, draws: int, states:
     )
 
 
-def _room_to_go_on(
-    problem: Problem, sampling_method: SamplingMethod, settings: Method, chains: int, draws: int,
-    states: bool,
-) -> bool:  # fmt: skip
-    """Whether memory holds the draws of chains that are continued."""
+def _room_for(problem: Problem, by_row: bool, chains: int, draws: int, states: bool) -> bool:
+    """Whether memory holds the draws of chains that go on so far."""
     try:
-        by_row = sampling_method.by_row(settings)
-        _check_room(problem, by_row, chains, GO_ON[-1] * draws, states)
+        _check_room(problem, by_row, chains, draws, states)
     except ArgumentError:
         return False
     return True

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import numbers
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -66,6 +67,24 @@ class VarianceLink:
     power: float
 
 
+class DistributionAsNumber(ModelError):
+    """A distribution stands where a number does, as if it had been drawn from."""
+
+    distribution: Distribution | None = None
+
+    @classmethod
+    def of(cls, what: str, distribution: Distribution) -> DistributionAsNumber:
+        """what : where it stands: "one side of == is"."""
+        error = cls(
+            f"{what} {distribution!r}, a distribution and not a number",
+            fix="pass numbers, or expressions of the function's arguments: a distribution has no "
+            "value here; returned under a name, its draw is an argument of another function",
+            where=user_location(),
+        )
+        error.distribution = distribution
+        return error
+
+
 # (law, value) -> where a parameter of the law makes the density of the value highest
 Maximiser = Callable[[Any, ExprArray], Any]
 
@@ -105,6 +124,13 @@ class Distribution:
         if "__init__" in cls.__dict__:
             cls.__init__ = checking_arguments(cls.__init__)  # type: ignore[method-assign]
 
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, (numbers.Number, np.ndarray, Expr)):
+            raise DistributionAsNumber.of("one side of == is", self)
+        return self is other
+
     def _set(self, **parameters: Any) -> None:
         """Convert, broadcast (elementwise distributions) and remember the parameters.
 
@@ -113,6 +139,10 @@ class Distribution:
         self.location = user_location()
         arrays = {}
         for name, value in parameters.items():
+            if isinstance(value, Distribution):
+                raise DistributionAsNumber.of(
+                    f"{type(self).__name__}: {_plain_name(name)} is", value
+                )
             try:
                 arrays[name] = array(value)
             except (TypeError, ValueError) as error:

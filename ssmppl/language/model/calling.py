@@ -19,7 +19,9 @@ from ssmppl.errors import Location, ModelError, SSMError, UnsupportedOperation
 from ssmppl.expressions.expr import INDEX_BY_SYMBOL, topological
 from ssmppl.expressions.numpy_protocols import UNSUPPORTED
 from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
+from ssmppl.language.distributions.base import DistributionAsNumber
 from ssmppl.language.model.closure_digest import INSTALLED, outer_values, plain_function
+from ssmppl.language.model.drawn_inside import computed_with
 from ssmppl.language.model.lookups import check_lookups, instructions
 from ssmppl.language.model.model import location_of
 from ssmppl.language.model.name_hints import name_hint
@@ -103,6 +105,8 @@ def call_once(function: Law, role: str, arguments: dict[str, Any], known: Roles)
         bound = signature.bind_partial()
         bound.arguments.update({n: arguments[n] for n in signature.parameters if n in arguments})
         return function(*bound.args, **bound.kwargs)
+    except DistributionAsNumber as error:
+        raise _wrapped(error, function, role, arguments, known) from error
     except SSMError as error:
         moved = _at_users_line(error, function)
         if moved is error and isinstance(error, UnsupportedOperation):
@@ -245,6 +249,8 @@ def _wrapped(
     elif (called := _library_function(function, error.__traceback__)) in UNSUPPORTED:
         found = f"{called}() of a library takes numbers, not symbols"
         fix = f"write {UNSUPPORTED[called]}"
+    elif drawn := computed_with(error, function, role):
+        found, fix = drawn
     elif asked := _of_a_symbol(error):
         found, fix = f"@{role} {function.__name__} {asked[0]}", asked[1]
     elif _OBJECT_ARRAY.search(str(error)):

@@ -156,19 +156,20 @@ def test_what_has_no_approximation_is_refused():
 
 
 @pytest.mark.parametrize("kept", [False, True], ids=["in memory", "checkpoint"])
-def test_chains_that_have_not_mixed_go_on(monkeypatch, tmp_path, kept):
+def test_chains_that_have_not_converged_go_on(monkeypatch, tmp_path, kept):
     y = ssm.simulate(models.stationary, steps=20, seed=2)["y"].values[0]
     options = {"warmup": 30, "chains": 2, "states": False, **QUIET}
-    monkeypatch.setattr(verb, "have_mixed", lambda chains, free: False)
+    monkeypatch.setattr(verb, "have_converged", lambda chains, free: False)
+    monkeypatch.setattr(verb, "LEAST_TO_GO_ON", 80)
     path = tmp_path / "a.npz" if kept else None
     found = ssm.sample(models.stationary, {"y": y}, draws=40, checkpoint=path, **options)
-    assert found["posterior"].attrs["further_draws"] == 120
+    assert found["posterior"].attrs["further_draws"] == 8 * 40
     method = getattr(ssm, found["posterior"].attrs["method"])()
     if isinstance(method, ssm.Gibbs):
         method = ssm.Gibbs(interweave="auto")
-    longer = ssm.sample(models.stationary, {"y": y}, method, draws=160, **options)
+    longer = ssm.sample(models.stationary, {"y": y}, method, draws=9 * 40, **options)
     for name in ("phi", "tau"):
-        expected = longer["posterior"][name].values[:, 80::2]
+        expected = longer["posterior"][name].values[:, 40::8]
         np.testing.assert_array_equal(found["posterior"][name].values, expected)
     if kept:
         again = ssm.sample(models.stationary, {"y": y}, draws=40, checkpoint=path, **options)
