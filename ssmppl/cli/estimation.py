@@ -146,8 +146,8 @@ def summary(
     """The parameters of POSTERIOR.nc, a file that `ssmppl sample` wrote.
 
     Prints mean, standard deviation, their Monte Carlo errors, bulk and tail effective sample size
-    and R-hat of each number, and marks those whose chains have not converged. Writes the table only where -o
-    says where.
+    and R-hat of each number, and marks those whose chains have not converged. Writes
+    the table only where -o says where.
 
     \b
         ssmppl summary posterior.nc

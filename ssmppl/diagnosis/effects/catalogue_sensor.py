@@ -75,7 +75,7 @@ def both_clippings(h, strength, c, middle):
 
 
 @effect(on="channel", kind="observation", name="sensor rectification", lower=0, upper=1,
-        afresh=0.9)  # fmt: skip
+        requires="additive", afresh=0.9)  # fmt: skip
 def sensor_rectification(h, strength):
     """l (|h| - h): 1/2 cuts what is below 0 off, 1 folds it up"""
     return strength * (np.abs(h) - h)
@@ -99,7 +99,7 @@ def sensor_delay(h, earlier, strength, delay, start):
                      {"earlier": Dirac(np.full(int(delay), start))})  # fmt: skip
 
 
-@effect(on="channel", kind="observation", name="quantisation", lower=0,
+@effect(on="channel", kind="observation", name="quantisation", lower=0, requires="additive",
         shapes={"d": sds(0.25, 0.5, 1.0)})  # fmt: skip
 def quantisation(h, strength, d):
     """l (round(h / d) d - h)"""

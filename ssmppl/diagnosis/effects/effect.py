@@ -9,7 +9,8 @@ kind           bound to           what the function returns
 =============  =================  ================================================================
 "transition"   state              increment of the transition's mean; or, by argument, of several
                                   states: ``{"x": -over, "other": over}``
-"observation"  channel            increment of the observation's mean; first argument: that mean
+"observation"  channel            increment of the observation's mean; first argument: that mean,
+                                  on the scale on which increments act
 "input"        input              the input that acts in its place (itself at strength 0)
 "noise"        state or channel   increment of the log variance of its distribution
 "tail"         state or channel   1 / df of Student's t in place of the normal distribution
@@ -88,7 +89,7 @@ GIVEN = (
 )
 ON = ("any", "rate", "state", "channel", "input", "parameter", "positive parameter",
       "other parameter")  # fmt: skip
-REQUIRES = ("positive", "both signs")
+REQUIRES = ("positive", "both signs", "additive")
 PROCESSES = ("random walk", "ar1")  # of zero mean: their score in `strength` is zero
 
 # What naming an effect says: a function of states, inputs and their past, with few numbers; a
@@ -213,7 +214,8 @@ class Effect:
     constant : what it is called with its process or profile held at 1; effects that share this
         name are then the same.
     requires : "positive" where it makes sense for a variable above 0 only, "both signs" where it
-        is a constant for one that never changes its sign.
+        is a constant for one that never changes its sign, "additive" where increments of the mean
+        are no such on another scale (see above).
     afresh : the strength with which the model is fitted anew from its own start where the variable
         keeps one sign, None for no such fit: its fit may lie where the effect is nothing.
     common : whether it is offered for all inputs at once, too, with one strength: what delays the
@@ -247,8 +249,8 @@ class Effect:
     @property
     def cause(self) -> str:
         """What naming it says, one of `CAUSES`."""
-        if self.kind in ("noise", "tail"):
-            return NOISE_LAW
+        if self.kind in ("noise", "tail") or (self.process and self.on == "channel"):
+            return NOISE_LAW  # of a sensor: nothing enters the system by it
         if self.process:
             return UNKNOWN_INPUT
         return CHANGE_IN_TIME if self.profile or self.kind == "initial" else MECHANISM

@@ -205,7 +205,7 @@ def _first(effect: Effect, equations: Equations, part: Part, role: str) -> Expr:
         return _value(equations.mean(part, "initial"), effect)
     if part.role != "channel":
         return part.seen_from(role)
-    mean = _value(equations.mean(part), effect)
+    mean = _value(equations.reading(part), effect)
     if role != "transition":
         return mean
     moved = ("state", "input", "time")

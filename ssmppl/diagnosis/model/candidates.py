@@ -227,6 +227,9 @@ def _reason(effect: Effect, part: Part, equations: Equations, scales: Scales) ->
         return found.reason
     if found:
         return found
+    if effect.requires == "additive":
+        scale = scale_of_mean(equations.law(part))
+        return "" if scale == "identity" else "increments of its mean act on another scale"
     if effect.requires:
         low, high = (scales.scale[part.label].quantile(level) for level in (0.02, 0.98))
         if effect.requires == "positive" and low <= 0.0:

@@ -35,6 +35,7 @@ Changes = Mapping[Index, Expr]
 # by 1e-5 (e^4 - 2 e^2 - 1) / 4, large enough that derivatives in 1 / df survive the rounding of
 # log Gamma((df + 1) / 2) - log Gamma(df / 2).
 NORMAL = 1e-5
+LEAST = 1e-6  # mean of a count below which its logarithm is taken for that of this
 
 
 def rebuilt(d: Distribution, parameters: Mapping[str, Any]) -> Distribution:
@@ -81,6 +82,38 @@ def noise_free(d: Distribution, index: Index) -> Expr:
     values = array(_inner(d).noise_free())
     entry: Expr = values[index] if values.ndim == len(index) else values[()]
     return entry
+
+
+def on_its_scale(d: Distribution, index: Index) -> Expr:
+    """The value without noise on the scale of `scale_of_mean`, on which increments are added: of a
+    count the log of its mean, at least `LEAST`, of a share the logit."""
+    inner = _inner(d)
+    link = inner.mean_link
+    assert link is not None
+    if link.scale == "log":
+        return apply("log", apply("maximum", noise_free(d, index), LEAST))
+    if link.scale == "identity":
+        return noise_free(d, index)
+    values = np.broadcast_to(inner.parameters[link.parameter].view(np.ndarray), d.shape)
+    value: Expr = values[index]
+    if link.scale == "mean of the log":
+        return value
+    return apply("log", value / (1.0 - value))
+
+
+def values_on_its_scale(d: Distribution, values: np.ndarray) -> np.ndarray:
+    """Measured values on that scale, NaN where missing; half a count above 0 and below the largest
+    where a logarithm needs it."""
+    scale = scale_of_mean(d)
+    if isinstance(scale, NotApplicable) or scale == "identity":
+        return values
+    with np.errstate(invalid="ignore"):
+        if scale == "logit":
+            most = np.nanmax(values, initial=1.0)
+            return np.asarray(np.log((values + 0.5) / (most - values + 0.5)))
+        positive = values[values > 0.0]
+        least = 0.5 * float(positive.min()) if positive.size else 1.0
+        return np.asarray(np.log(np.maximum(values, least)))
 
 
 def shifted(d: Distribution, changes: Changes) -> Distribution:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.model.changed_laws import Index, noise_free, scale_of_mean
+from ssmppl.diagnosis.model.changed_laws import Index, noise_free, on_its_scale, scale_of_mean
 from ssmppl.diagnosis.model.forces import Force, force_on
 from ssmppl.errors import NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
@@ -140,6 +140,12 @@ class Equations:
         d = self.law(part, role)
         scale = scale_of_mean(d)
         return scale if isinstance(scale, NotApplicable) else noise_free(d, part.index)
+
+    def reading(self, part: Part) -> Expr | NotApplicable:
+        """What a channel reads without noise, on the scale on which increments of its mean act."""
+        d = self.law(part)
+        scale = scale_of_mean(d)
+        return scale if isinstance(scale, NotApplicable) else on_its_scale(d, part.index)
 
     def step(self, part: Part) -> Expr | NotApplicable:
         """mean - x_prev: how far a state moves in a step, without noise in it nor in new values of

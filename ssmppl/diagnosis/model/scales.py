@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.diagnosis.effects.effect import Grid
+from ssmppl.diagnosis.model.changed_laws import values_on_its_scale
 from ssmppl.diagnosis.model.equations import label_of
 from ssmppl.language.model.trace import Trace
 
@@ -72,7 +73,10 @@ class Scales:
                   (trace.input_symbols, inputs))  # fmt: skip
         for group, values in groups:
             for i, s in enumerate(group):
-                out[label_of(*s.data[1:])] = VariableScale.of(np.asarray(values)[..., i])
+                label, own = label_of(*s.data[1:]), np.asarray(values)[..., i]
+                if s.data[0] == "observation":  # what acts on it sees it so
+                    own = values_on_its_scale(trace.observations[s.data[1]].distribution, own)
+                out[label] = VariableScale.of(own)
         return cls(out, rows)
 
 

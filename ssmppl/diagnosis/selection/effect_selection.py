@@ -42,6 +42,7 @@ from ssmppl.diagnosis.selection.refit import (
     delays,
     leading,
     one_signed_candidates,
+    other_noise_laws,
     pairs,
     preferred,
     refit_all,
@@ -165,6 +166,7 @@ class EffectSelection:
             stages["refitting correlated candidates"] = lambda: correlated_candidates(
                 screen, refits
             )
+            stages["refitting other laws of noises"] = lambda: other_noise_laws(screen, refits)
             stages["refitting other delays"] = lambda: delays(screen, refits)
             stages["refitting delays of inputs"] = lambda: self._delayed(out, refits)
             stages[AFRESH] = lambda: one_signed_candidates(screen)

@@ -51,6 +51,7 @@ SINGLES, CORRELATED, PAIRS = 5, 4, 3  # leading ones, further ones like the best
 MOST_OF_A_KIND = {CHANGE_IN_TIME: 2, UNKNOWN_INPUT: 2, NOISE_LAW: 1}  # of the leading ones
 MOST_OF_NO_CAUSE = 3  # likewise, of these together
 PAIRED = 12  # leading ones of which pairs are made
+NOISES = 6  # laws of a noise beside the best one
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 LEAST_PAIR_GAIN = 2.0  # nats that it must promise of a pair beyond the best single one
 ALIKE = 0.8  # correlation with the best from which a candidate is refitted beside it
@@ -60,6 +61,7 @@ NEAR = 25.0  # nats behind the best, up to which other delays and dates are trie
 NEIGHBOURS = 6  # dates
 ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
 
+TIE = 0.5  # nats that tell no two refits apart
 EXPLAINED = 0.5  # of the score of an unknown input, by a mechanism that is named in its place
 
 # How a refit starts, and when it is ranked.
@@ -319,6 +321,21 @@ def correlated_candidates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     return sorted(found, key=lambda k: -like[k])[:CORRELATED]
 
 
+def other_noise_laws(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """Where a law of a noise gains most: the best form of each other one, in every equation, since
+    noises share their scales. What a score promises is far less than what outliers, or a memory,
+    gain once they are strong."""
+    if not refits or refits[0].candidates[0].effect.cause != NOISE_LAW:
+        return []
+    candidates, out = screen.design.candidates, dict[tuple[str, str], int]()
+    done = {(c.effect.name, c.equation) for r in refits for c in r.candidates}
+    for k in _promising(screen):
+        c = candidates[k]
+        if c.effect.cause == NOISE_LAW and (c.effect.name, c.equation) not in done:
+            out.setdefault((c.effect.name, c.equation), k)
+    return list(out.values())[:NOISES]
+
+
 def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     """The other numbers of states, as delays are, of those near the best that have one, and the
     dates next to those that are dated: nothing between two of them can be estimated. Of a model
@@ -366,10 +383,11 @@ def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
 def preferred(refits: Sequence[Refit], worth: float) -> list[Refit]:
     """The refits in the order in which they are named: what gains most first, but for what fits any
     misfit, or what happened once: that comes behind a cause which is asked earlier (`ASKED`), gains
-    `worth` by itself and has `EXPLAINED` of its score."""
+    `worth` by itself and has `EXPLAINED` of its score. Of equal ones, as a constant load and an
+    offset of the only input are, the one that the catalogue has first."""
     rest, out = sorted(refits, key=lambda r: -r.score), []
     while rest:
-        best = rest[0]
+        best = min((r for r in rest if r.score >= rest[0].score - TIE), key=lambda r: r.index)
         for r in rest:
             explains = r.penalised_gain >= worth and r.score >= EXPLAINED * rest[0].score
             if r.asked < best.asked and explains:

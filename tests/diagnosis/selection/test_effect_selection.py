@@ -417,9 +417,9 @@ def test_every_effect_says_what_naming_it_means():
     for name in ("parameter break", "parameter drift", "sensor drift", "level break",
                  "wrong initial state", "periodic forcing"):  # fmt: skip
         assert {c for (n, _), c in found.items() if n == name} == {"change in time"}
-    for name in ("missing input", "coloured noise", "parameter random walk"):
+    for name in ("missing input", "parameter random walk"):
         assert {c for (n, _), c in found.items() if n == name} == {"unknown input"}
-    for name in ("outliers", "heteroscedastic noise"):
+    for name in ("outliers", "heteroscedastic noise", "coloured noise"):
         assert {c for (n, _), c in found.items() if n == name} == {"noise law"}
 
 
