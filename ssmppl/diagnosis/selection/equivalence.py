@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.diagnosis.screening.screen import Screen
-from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.diagnosis.selection.refit import TIE, Refit
 
 SEPARATING = 2.7  # 1.645^2: times 1 / (1 - |rho|), the gain that separates two effects at 5%
 LEAST_CUT = 2.0  # nats behind the best that any member of a confidence set may be
@@ -194,7 +194,7 @@ def _of_the_best(
 ) -> np.ndarray:  # fmt: skip
     """(K,) bool: the confidence set among the refitted, who come first, and who is like the best
     among those that were not."""
-    own = np.flatnonzero(gains[:refitted] <= gains[0])
+    own = np.flatnonzero(gains[:refitted] <= gains[0] + TIE)
     cut = cuts(rho[np.ix_(own, own)], gains[own], range(len(own)), sided=sided[own])
     cut = np.maximum(cut, np.where(kind[own] == kind[0], FORM * gains[0], 0.0))
     out = np.zeros(len(gains), bool)

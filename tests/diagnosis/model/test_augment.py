@@ -15,7 +15,15 @@ from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.diagnosis.effects.effect import Auxiliary, effect
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.model.changed_laws import NORMAL, heavier, noise_free, scaled, shifted
+from ssmppl.diagnosis.model.changed_laws import (
+    NORMAL,
+    heavier,
+    noise_free,
+    on_its_scale,
+    scaled,
+    shifted,
+    values_on_its_scale,
+)
 from ssmppl.diagnosis.report.model_file import to_model
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import differentiate
@@ -119,6 +127,33 @@ def test_increments_act_on_the_scale_that_is_said(law, scale):
         evaluate(noise_free(d, ()), POINT) / size for d in (law, shifted(law, {(): constant(by)}))
     )
     assert link(after) - link(before) == pytest.approx(by, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("law", "link"),
+    [
+        (D.Normal(A, sd=P), lambda m: m), (D.LogNormal(A, sd=P), lambda m: np.log(m)),
+        (D.Poisson(A), np.log), (D.Gamma(A, rate=P), np.log), (D.Exponential(rate=A), np.log),
+        (D.Bernoulli(P), lambda m: np.log(m / (1 - m))),
+        (D.Binomial(7, P), lambda m: np.log(m / (7 - m))),
+    ],
+)  # fmt: skip
+def test_effects_see_a_channel_on_the_scale_on_which_they_act(law, link):
+    """So that a lag moves a count towards an earlier one, and clipping holds it where it clips: by
+    an increment of the log, what lies above is taken off."""
+    own = evaluate(on_its_scale(law, ()), POINT)
+    assert own == pytest.approx(link(evaluate(noise_free(law, ()), POINT)), rel=1e-12)
+    target = own - 0.4
+    clipped = shifted(law, {(): constant(target) - on_its_scale(law, ())})
+    assert evaluate(on_its_scale(clipped, ()), POINT) == pytest.approx(target, rel=1e-9)
+
+
+def test_measured_values_on_that_scale():
+    y = np.array([0.0, 4.0, np.nan, 10.0])
+    np.testing.assert_allclose(values_on_its_scale(D.Poisson(A), y), np.log([2.0, 4.0, np.nan, 10]))
+    np.testing.assert_array_equal(values_on_its_scale(D.Normal(A, sd=1.0), y), y)
+    shares = values_on_its_scale(D.Bernoulli(P), np.array([0.0, 1.0, np.nan]))
+    np.testing.assert_allclose(shares, [-np.log(3.0), np.log(3.0), np.nan])
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from ssmppl.diagnosis.selection.refit import (
     delays,
     leading,
     one_signed_candidates,
+    other_noise_laws,
     preferred,
 )
 from ssmppl.diagnosis.selection.refit_test import gain_p
@@ -386,6 +387,41 @@ def test_what_describes_a_misfit_comes_behind_a_cause_that_explains_it(refits, f
     ordered = preferred(made, worth=8.0)
     assert ordered[0] is made[first]
     assert len(ordered) == len(made)
+
+
+def test_of_equal_refits_the_one_of_the_catalogue_that_comes_first_is_named():
+    """A constant load and an offset of the only input are one model: rounding would decide."""
+    offset, load = (
+        replace(refitted("mechanism", g), index=(k,)) for g, k in ((117.01, 7), (117, 3))
+    )
+    assert preferred([offset, load], worth=8.0) == [load, offset]
+    more = replace(offset, gain=117.6)
+    assert preferred([more, load], worth=8.0) == [more, load]
+    kinds = np.array(["mechanism"] * 2)
+    together = _of_the_best(np.ones((2, 2)), np.array([117.0, 117.01]), np.zeros(2, int), 2,
+                            np.ones(2, bool), kinds)  # fmt: skip
+    assert together.all()
+
+
+@pytest.mark.parametrize(
+    ("first", "expected"),
+    [
+        ((0, "noise law"), [2, 3]),  # the best form of each other one; 4 promises nothing
+        ((1, "mechanism"), []),
+    ],
+)
+def test_other_laws_of_noises_are_refitted_where_one_gains_most(first, expected):
+    """The score of outliers at none promised 8 nats of the 71 that they gained."""
+    screen = screen_of([5.0, 4.0, 3.0, 2.5, 0.1, 2.0, 2.2], np.eye(7), "nmnnnnn")
+    names = ["growing", "drag", "outliers", "outliers", "memory", "outliers", "growing"]
+    places = ["y1", "x", "y1", "y2", "y1", "y1", "y1"]
+    for c, name, place in zip(screen.design.candidates, names, places, strict=True):
+        c.effect.name, c.equation = name, place
+    refits = [
+        Refit((k,), (screen.design.candidates[k],), None, None, g)
+        for k, g in ((first[0], 9.0), (1 - first[0], 5.0))
+    ]
+    assert other_noise_laws(screen, refits) == expected
 
 
 @pytest.mark.parametrize(
