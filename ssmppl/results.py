@@ -53,6 +53,7 @@ def to_inference_data(
     time: Any = None,
     dims: Mapping[str, Sequence[str]] | None = None,
     coords: Mapping[str, Any] | None = None,
+    renamed: Mapping[str, str] | None = None,
     attrs: Mapping[str, Any] | None = None,
 ) -> Any:
     """ArviZ InferenceData of a run; under ArviZ 1.x an `xarray.DataTree` with the same groups.
@@ -78,6 +79,8 @@ def to_inference_data(
         variable of the same name in another group that has fewer takes the first of them.
     coords
         Values of further coordinates, by dim.
+    renamed
+        Other names of dims that follow from the names of variables: `x_dim_0`.
     attrs
         What the run was. Made fit for netCDF (see `netcdf_attributes`), and written on the whole
         and on every group of draws.
@@ -105,6 +108,7 @@ def to_inference_data(
             time=time,
             dims=dims or {},
             coords=coords or {},
+            renamed=renamed or {},
             attrs={} if group in fixed else written,
         )
     return _container(groups, written)
@@ -118,6 +122,7 @@ def to_dataset(
     time: Any = None,
     dims: Mapping[str, Sequence[str]] | None = None,
     coords: Mapping[str, Any] | None = None,
+    renamed: Mapping[str, str] | None = None,
     attrs: Mapping[str, Any] | None = None,
 ) -> xr.Dataset:
     """A Dataset with dims `sample_dim` ("draw" or "trajectory"), `time`, then `<name>_dim_0`, ...
@@ -130,7 +135,7 @@ def to_dataset(
         tuple.
     over_time
         Names with a time axis; None means all.
-    time, dims, coords, attrs
+    time, dims, coords, renamed, attrs
         As in `to_inference_data`.
     """
     leading = (sample_dim,) if isinstance(sample_dim, str) else sample_dim or ()
@@ -141,6 +146,7 @@ def to_dataset(
         time=time,
         dims=dims or {},
         coords=coords or {},
+        renamed=renamed or {},
         attrs=_provenance() | netcdf_attributes(attrs or {}),
     )
 
@@ -245,6 +251,7 @@ def _dataset(
     time: Any,
     dims: Mapping[str, Sequence[str]],
     coords: Mapping[str, Any],
+    renamed: Mapping[str, str],
     attrs: Mapping[str, Any],
 ) -> xr.Dataset:
     import xarray as xr
@@ -258,6 +265,7 @@ def _dataset(
         else:
             labels = (*sample_dims, "time") if name in over_time else sample_dims
             labels += tuple(f"{name}_dim_{i}" for i in range(array.ndim - len(labels)))
+        labels = tuple(renamed.get(label, label) for label in labels)
         if len(labels) != array.ndim:
             expected = ", ".join(labels)
             raise ValueError(f"{name!r} has shape {array.shape}, but its dims are ({expected})")

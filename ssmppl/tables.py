@@ -110,8 +110,12 @@ def state_table(dataset: xr.Dataset) -> pd.DataFrame:
             mean, sd = variable.values[0], dataset[f"{name}_sd"].values[0]
         else:
             continue
+        named = [d for d in variable.dims[2:] if not str(d).startswith(f"{name}_dim_")]
         for index in np.ndindex(*mean.shape[1:]):
             label = component_label(str(name), index, dataset)
+            if named:
+                own = (dataset[d].values[i] for d, i in zip(variable.dims[2:], index, strict=True))
+                label = f"{name}[{', '.join(map(str, own))}]"
             columns[f"{label} mean"] = mean[(slice(None), *index)]
             columns[f"{label} sd"] = sd[(slice(None), *index)]
     return pd.DataFrame(columns, index=pd.Index(dataset["time"].values, name="time"))

@@ -114,6 +114,8 @@ class _Tracer:
         check_states(initial | draws, transition, proposal, draws)
         initial |= draws
         check_dims(self.known, self.owner)
+        shapes = {name: shape for name, (_, shape) in self.known.items()}
+        model.component_names.check(shapes, model.location)
         self._check_outer_names()
         self._check_defaults()
         traced = Trace(
@@ -125,6 +127,7 @@ class _Tracer:
             proposal=proposal,
             inputs=dict(model.inputs),
             time_step=model.time_step,
+            component_names=model.component_names,
             locations=locations,
             functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},
             choices=choices,

@@ -62,7 +62,7 @@ def supports(traced: Trace) -> dict[str, tuple[float, float]]:
     for site in traced.parameters.values():
         support = site.distribution.support()
         bounds = [_filled(b, site.shape) for b in (support.lower, support.upper)]
-        for label, _, low, high in _each(site, *bounds):
+        for label, _, low, high in _each(traced, site, *bounds):
             ends = [
                 float(e.data) if getattr(e, "op", "") == "const" else without
                 for e, without in ((low, -np.inf), (high, np.inf))
@@ -86,18 +86,18 @@ def priors_of(model: Model) -> dict[str, Prior]:
         d = site.distribution
         others = symbols_of([e for p in d.parameters.values() for e in np.ravel(p)])
         exact = not d.joint and not others and d.proper
-        for index, (label, symbol) in zip(np.ndindex(site.shape), _each(site), strict=True):
+        for index, (label, symbol) in zip(np.ndindex(site.shape), _each(traced, site), strict=True):
             own = None if draws is None or exact else draws[:, place[symbol]]
             found[label] = Prior(site if exact else None, index, own, *ends[label])
     return found
 
 
-def _each(site: Site, *more: np.ndarray) -> list[tuple[Any, ...]]:
+def _each(traced: Trace, site: Site, *more: np.ndarray) -> list[tuple[Any, ...]]:
     """(label, symbol, of each further array its entry) of the components of a parameter."""
     symbols = site.value.view(np.ndarray)
     found = []
     for index in np.ndindex(site.shape):
-        label = site.name + (f"[{', '.join(map(str, index))}]" if index else "")
+        label = traced.component_names.label(site.name, index)
         found.append((label, symbols[index], *(m[index] for m in more)))
     return found
 
@@ -153,5 +153,5 @@ def prior_draws(dataset: Any) -> dict[str, Prior]:
         if not time_axes(variable.dims):
             values = variable.transpose("chain", "draw", ...).values
             flat = values.reshape(-1, *values.shape[2:])
-            found |= {k: Prior(draws=v) for k, v in components(str(name), flat, 1)}
+            found |= {k: Prior(draws=v) for k, v in components(str(name), flat, 1, variable)}
     return found

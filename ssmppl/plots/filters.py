@@ -204,7 +204,9 @@ def plot_ancestry(
         name = str(key_)
         if name.endswith("_particles") and "particle" in variable.dims:
             array = variable.transpose("time", "particle", ...).values
-            values |= components(name.removesuffix("_particles"), array, 2)
+            values |= components(
+                name.removesuffix("_particles"), array, 2, variable.isel(particle=0)
+            )
     states = few(pick(values, var_names, "the states of the filter"), "plot_ancestry")
     ancestors = own["particle_ancestor"].transpose("time", "particle").values
     alive = survivors(ancestors)

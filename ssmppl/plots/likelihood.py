@@ -133,7 +133,8 @@ def _given(result: Any) -> tuple[dict[str, np.ndarray], dict[str, float]]:
         paths, _ = iterates_of(result)
         values: dict[str, float] = {}
         for name, value in result.parameters.items():
-            values |= {k: float(v) for k, v in components(name, np.asarray(value), 0)}
+            like = result.iterates.get(name)
+            values |= {k: float(v) for k, v in components(name, np.asarray(value), 0, like)}
         return paths, values
     if is_inference_data(result):
         draws = parameter_draws(result, "plot_likelihood")
@@ -143,7 +144,7 @@ def _given(result: Any) -> tuple[dict[str, np.ndarray], dict[str, float]]:
 
 
 def _labels(problem: Problem) -> list[str]:
-    return [repr(s) for s in problem.trace.parameter_symbols]
+    return [problem.trace.label(s) for s in problem.trace.parameter_symbols]
 
 
 def _place(problem: Problem, label: str) -> int:

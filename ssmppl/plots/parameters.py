@@ -37,7 +37,7 @@ def parameter_draws(idata: Any, verb: str) -> dict[str, np.ndarray]:
     for name, variable in posterior.data_vars.items():
         if not time_axes(variable.dims):
             values = variable.transpose("chain", "draw", ...).values
-            found |= components(str(name), np.asarray(values, dtype=float), 2)
+            found |= components(str(name), np.asarray(values, dtype=float), 2, variable)
     if not found:
         raise ArgumentError(
             "the posterior holds no parameters: all of them are fixed, or the model has none",
@@ -202,7 +202,7 @@ def iterates_of(estimate: Estimate) -> tuple[dict[str, np.ndarray], dict[str, np
         if str(name) in estimate.parameters and str(name) not in held:
             values, shape = variable.values, np.shape(estimate.parameters[str(name)])
             one = values.ndim == 1 + len(shape)  # of a single start
-            paths |= components(str(name), values[None] if one else values, 2)
+            paths |= components(str(name), values[None] if one else values, 2, variable)
     figures: dict[str, np.ndarray] = {}
     objective = str(estimate.attrs.get("objective", "likelihood"))
     for name, label in (("objective", OBJECTIVES.get(objective, objective)),

@@ -117,8 +117,8 @@ def _of_filter(result: Any) -> tuple[list[Record], list[dict[str, np.ndarray]]]:
                 )
             states |= quantiles_at_levels(one, str(key_), name, "plot_predictions")
             if f"{name}_observed" in own:
-                data |= components(name, own[f"{name}_observed"].values, 1)
-            pit |= components(name, own[f"{name}_pit"].values, 1)
+                data |= components(name, own[f"{name}_observed"].values, 1, own[f"{name}_observed"])
+            pit |= components(name, own[f"{name}_pit"].values, 1, own[f"{name}_pit"])
         if not states:
             raise wrong_kind("plot_predictions", one, WANTED)
         records.append(Record(title, one["time"].values, states, data))
@@ -139,7 +139,7 @@ def _drawn(idata: Any) -> list[Record]:
                 values = variable.transpose("chain", "draw", axis, ...).values
                 plain = str(name).removesuffix(mark) if mark else str(name)
                 flat = values.reshape(-1, *values.shape[2:])
-                states |= {k: bands(v) for k, v in components(plain, flat, 2)}
+                states |= {k: bands(v) for k, v in components(plain, flat, 2, variable)}
         data = data_of(group(idata, "observed_data"), mark, axis)
         title = f"experiment {mark[1:]}" if mark else ""
         found.append(Record(title, drawn[axis].values, states, data, mark=mark))

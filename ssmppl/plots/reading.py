@@ -7,6 +7,7 @@ moments, or a list of those for several experiments. Here each experiment become
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -37,6 +38,7 @@ __all__ = [
 ]
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)  # the ends of the bands, and the median
+_UNNAMED = re.compile(r".*_dim_\d+")  # a dim whose components have numbers for names
 STATES_FROM = "give what ssm.sample(..., states=True), ssm.smooth or a filter returns"
 
 
@@ -96,10 +98,20 @@ def group_of(verb: str, result: Any, name: str, fix: str) -> Any:
     return found
 
 
-def components(name: str, values: np.ndarray, leading: int) -> Iterator[tuple[str, np.ndarray]]:
-    """(label, values) of each scalar of a variable, whose first `leading` axes are kept."""
+def components(
+    name: str, values: np.ndarray, leading: int, like: Any = None
+) -> Iterator[tuple[str, np.ndarray]]:
+    """(label, values) of each scalar of a variable, whose first `leading` axes are kept.
+
+    like : the variable of a result, whose dims name the components; None: by their numbers.
+    """
+    further = values.ndim - leading
+    dims = [] if like is None else list(like.dims)[like.ndim - further :]
+    names: list[Any] = [None if _UNNAMED.fullmatch(str(d)) else like[d].values for d in dims]
+    names = names or [None] * further
     for index in np.ndindex(values.shape[leading:]):
-        label = name + (f"[{', '.join(map(str, index))}]" if index else "")
+        own = [i if k is None else k[i] for i, k in zip(index, names, strict=True)]
+        label = name + (f"[{', '.join(map(str, own))}]" if index else "")
         yield label, values[(slice(None),) * leading + index]
 
 
@@ -154,7 +166,7 @@ def data_of(dataset: Any, mark: str, axis: str) -> dict[str, np.ndarray]:
         if axis in variable.dims:
             plain = str(name).removesuffix(mark) if mark else str(name)
             values = np.asarray(variable.transpose(axis, ...).values, dtype=float)
-            found |= components(plain, values, 1)
+            found |= components(plain, values, 1, variable)
     return found
 
 
@@ -190,7 +202,7 @@ def _of_posterior(idata: Any, verb: str) -> list[Record]:
                 values = variable.transpose("chain", "draw", axis, ...).values
                 flat = values.reshape(-1, *values.shape[2:])
                 plain = str(name).removesuffix(mark) if mark else str(name)
-                states |= {k: bands(v) for k, v in components(plain, flat, 2)}
+                states |= {k: bands(v) for k, v in components(plain, flat, 2, variable)}
         found.append(
             Record(
                 f"experiment {mark[1:]}" if mark else "",
@@ -218,13 +230,13 @@ def _of_dataset(dataset: Any, name: str, verb: str) -> Record:
     for key, variable in dataset.data_vars.items():
         label = str(key)
         if variable.dims[:2] == ("trajectory", "time"):
-            states |= {k: bands(v) for k, v in components(label, variable.values, 2)}
+            states |= {k: bands(v) for k, v in components(label, variable.values, 2, variable)}
         elif f"{label}_quantile" in dataset and not is_prediction(dataset, label):
             states |= quantiles_at_levels(dataset, label, label, verb)
         elif variable.dims[:1] == ("time",):
             for suffix, into in (("_observed", data), ("_input", inputs)):
                 if label.endswith(suffix):
-                    into |= components(label.removesuffix(suffix), variable.values, 1)
+                    into |= components(label.removesuffix(suffix), variable.values, 1, variable)
     if not states:
         raise wrong_kind(verb, dataset, STATES_FROM)
     return Record(name, dataset["time"].values, states, data, inputs,
@@ -254,7 +266,7 @@ def quantiles_at_levels(dataset: Any, variable: str, name: str, verb: str) -> di
             fix="leave quantiles= out of the call that made it",
         )
     values = np.moveaxis(quantiles.values[..., [p[0] for p in places]], -1, 0)  # (5, T, ...)
-    return dict(components(name, values, 2))
+    return dict(components(name, values, 2, quantiles.isel(quantile=0)))
 
 
 def _texts(levels: Sequence[float] | np.ndarray) -> str:

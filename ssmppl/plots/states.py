@@ -142,7 +142,7 @@ def plot_forecast(
     ahead: dict[str, np.ndarray] = {}
     for name, variable in result.data_vars.items():
         if variable.dims[:2] == ("draw", "time"):
-            ahead |= {k: bands(v) for k, v in components(str(name), variable.values, 2)}
+            ahead |= {k: bands(v) for k, v in components(str(name), variable.values, 2, variable)}
     before = None if idata is None else _before(idata, result)
     rows = few(pick(ahead, var_names, "the states and channels of the forecast"), "plot_forecast")
     past = max(4 * result.sizes["time"], LEAST_PAST) if past is None else past

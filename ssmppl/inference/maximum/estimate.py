@@ -193,7 +193,7 @@ def make_estimate(
     """
     dims = [beside(trace.parameters, n) for n in ("start", "iteration")[3 - iterates.ndim :]]
     free = free_components(trace, fixed)
-    labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
+    labels = [trace.label(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
     errors = np.full(len(theta), np.nan)
     with np.errstate(invalid="ignore"):
         errors[free] = np.sqrt(np.diagonal(covariance)[free])
@@ -210,7 +210,11 @@ def make_estimate(
             variables,
             sample_dim=tuple(dims),
             over_time=(),
-            coords={d: np.arange(n) for d, n in zip(dims, iterates.shape, strict=False)},
+            coords={
+                **trace.component_names.coords,
+                **{d: np.arange(n) for d, n in zip(dims, iterates.shape, strict=False)},
+            },
+            renamed=trace.component_names.renamed,
             attrs={k: v for k, v in attrs.items() if v is not None},
         ),
         attrs=attrs,

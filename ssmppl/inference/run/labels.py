@@ -24,12 +24,16 @@ if TYPE_CHECKING:
 TIME_ZONES = "time_zones"  # the attribute
 
 
-def with_data(result: xr.Dataset, experiment: Experiment) -> xr.Dataset:
+def with_data(result: xr.Dataset, trace: Trace, experiment: Experiment) -> xr.Dataset:
     """`result` and the data that it is about, (time, ...): `y_observed`, `u_input`."""
+    own = trace.component_names.renamed
     data = {f"{n}_observed": v for n, v in experiment.observed.items()}
     data |= {f"{n}_input": v for n, v in experiment.inputs.items()}
     named = {n: ["time", *component_dims(n.rpartition("_")[0], v, 1)] for n, v in data.items()}
-    return result.assign({n: (named[n], v) for n, v in data.items()})
+    named = {n: [own.get(d, d) for d in dims] for n, dims in named.items()}
+    out = result.assign({n: (named[n], v) for n, v in data.items()})
+    labels = trace.component_names.coords
+    return out.assign_coords({d: list(v) for d, v in labels.items() if d in out.dims})
 
 
 def component_dims(name: str, values: np.ndarray, leading: int) -> list[str]:
@@ -47,7 +51,7 @@ def model_attributes(trace: Trace) -> dict[str, Any]:
 
 def observes(trace: Trace) -> dict[str, str]:
     """Components of the observation whose mean, or location, is a component of the state itself:
-    `y[0]` to `x`.
+    `y[0]` to `x`, as results call them.
 
     These are in the same units, so that one can be drawn over the other.
     """
@@ -61,7 +65,7 @@ def observes(trace: Trace) -> dict[str, str]:
         for centre in centres:
             values = np.broadcast_to(array(centre).view(np.ndarray), site.shape).ravel()
             pairs = zip(symbols, values, strict=True)
-            found |= {repr(y): repr(x) for y, x in pairs if x in states}
+            found |= {trace.label(y): trace.label(x) for y, x in pairs if x in states}
     return found
 
 
@@ -102,15 +106,16 @@ class Labels:
     """dims, coords : of the variables named so far, for `to_inference_data`. attrs : the zones that
     dates were given in, by the dim over time, where they have any; dates themselves are in UTC."""
 
-    def __init__(self, experiments: Sequence[Experiment]):
+    def __init__(self, trace: Trace, experiments: Sequence[Experiment]):
+        self.renamed = trace.component_names.renamed
         self.several = len(experiments) > 1
         self.time = None if self.several else experiments[0].time
         self.dims: dict[str, list[str]] = {}
-        self.coords: dict[str, Any] = {}
+        self.coords: dict[str, Any] = dict(trace.component_names.coords)
         zones = {self.axis(i): e.zone for i, e in enumerate(experiments) if e.zone}
         self.attrs = {TIME_ZONES: zones} if zones else {}
         if self.several:
-            self.coords = {
+            self.coords |= {
                 self.axis(i): np.arange(1, e.steps + 1) if e.time is None else e.time
                 for i, e in enumerate(experiments)
             }

@@ -183,7 +183,7 @@ def filter_dataset(
         variables[f"{name}_sd"] = values
         dims[f"{name}_sd"] = ["time", *component_dims(name, values, 2)]
     variables["covariance"] = covariance
-    coords: dict[str, Any] = {"state": [repr(s) for s in trace.state_symbols]}
+    coords: dict[str, Any] = {"state": [trace.label(s) for s in trace.state_symbols]}
     coords["state_"] = coords["state"]
     if len(levels):
         coords["quantile"] = levels
@@ -212,8 +212,12 @@ def filter_dataset(
         variables |= {"particle_weight": weights, "particle_ancestor": ancestors}
         dims |= {n: ["time", "particle"] for n in ("particle_weight", "particle_ancestor")}
     attrs = {**attrs, "observes": observes(trace)}
-    out = to_dataset(variables, time=experiment.time, dims=dims, coords=coords, attrs=attrs)
-    return with_data(out, experiment)
+    out = to_dataset(
+        variables, time=experiment.time, dims=dims,
+        coords={**trace.component_names.coords, **coords},
+        renamed=trace.component_names.renamed, attrs=attrs,
+    )  # fmt: skip
+    return with_data(out, trace, experiment)
 
 
 def _predictions(

@@ -139,6 +139,8 @@ def forecast(
         over_time | unpack_parameters(traced, theta),
         over_time=set(over_time),
         time=labels,
+        coords=traced.component_names.coords,
+        renamed=traced.component_names.renamed,
         attrs={
             **model_attributes(traced),
             "seed": str(root.entropy),

@@ -180,7 +180,7 @@ def predict(
         )
     experiments = bind(traced, data, need_observations=False, steps=steps)
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
-    labels = Labels(experiments)
+    labels = Labels(traced, experiments)
     attrs: dict[str, Any] = {
         **model_attributes(traced), "seed": str(root.entropy), "observes": observes(traced),
     }  # fmt: skip
@@ -311,5 +311,5 @@ def _container(
         inputs |= labels.named(i, e.inputs)
     return to_inference_data(
         observed_data=observed, constant_data=inputs, time=labels.time, dims=labels.dims,
-        coords=labels.coords, attrs=attrs, **groups,
+        coords=labels.coords, renamed=labels.renamed, attrs=attrs, **groups,
     )  # fmt: skip

@@ -229,7 +229,8 @@ def sample(
     else:
         whole = checkpoint_file.stack(result)
     if sampling_method.markov:
-        labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
+        symbols = problem.trace.parameter_symbols
+        labels = [problem.trace.label(s) for s, f in zip(symbols, free, strict=True) if f]
         theta, interrupted = whole[0]["theta"][:, :, free], bool(attrs["interrupted"])
         attrs |= convergence_attributes(
             labels, theta, interrupted, sampling_method.advice(chosen), warmup
@@ -322,7 +323,7 @@ def _to_arviz(
     posterior = {
         n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in fixed_values
     }
-    labels = Labels(problem.experiments)
+    labels = Labels(trace, problem.experiments)
     over_time: list[str] = []
     observed: dict[str, np.ndarray] = {}
     inputs: dict[str, np.ndarray] = {}
@@ -346,5 +347,6 @@ def _to_arviz(
         time=labels.time,
         dims=labels.dims,
         coords=labels.coords,
+        renamed=labels.renamed,
         attrs=attrs | labels.attrs,
     )

@@ -190,7 +190,7 @@ def _score(
 ) -> Score:
     trace = problem.trace
     free = free_components(trace, fixed_values)
-    labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
+    labels = [trace.label(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
 
     def named(values: np.ndarray) -> dict[str, float | np.ndarray]:
         return {n: v for n, v in by_name(trace, values).items() if n not in fixed_values}

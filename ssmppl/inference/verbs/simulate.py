@@ -101,6 +101,8 @@ def simulate(
         variables,
         over_time=over_time,
         time=source.time,
+        coords=traced.component_names.coords,
+        renamed=traced.component_names.renamed,
         attrs=model_attributes(traced) | {"seed": str(root.entropy)},
     )
 

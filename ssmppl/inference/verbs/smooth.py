@@ -462,7 +462,7 @@ def _dataset(
             dims[f"{n}_sd"] = ["time", *component_dims(n, v, 2)]
         variables |= {"covariance": covariance, "covariance_previous": cross}
         dims |= {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
-        coords["state"] = coords["state_"] = [repr(s) for s in trace.state_symbols]
+        coords["state"] = coords["state_"] = [trace.label(s) for s in trace.state_symbols]
         if len(setup.levels):
             by_level = [unpack_states(trace, spread[:, :, p]) for p in range(len(setup.levels))]
             for name in by_level[0]:
@@ -471,8 +471,9 @@ def _dataset(
                 dims[f"{name}_quantile"] = ["time", *own, "quantile"]
             coords["quantile"] = setup.levels
     out = to_dataset(
-        variables, sample_dim=sample_dim, time=experiment.time, dims=dims, coords=coords,
+        variables, sample_dim=sample_dim, time=experiment.time, dims=dims,
+        coords={**trace.component_names.coords, **coords}, renamed=trace.component_names.renamed,
         attrs={**attrs, **found.attrs, "observes": observes(trace)},
     )  # fmt: skip
     out = out.assign({k: ("time", v) for k, v in (found.over_time or {}).items()})
-    return with_data(out, experiment)
+    return with_data(out, trace, experiment)

@@ -20,6 +20,7 @@ from ssmppl import markup
 from ssmppl.errors import Location, ModelError, UnknownName
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.model.closure_digest import digest_of_code, fingerprint, plain_function
+from ssmppl.language.model.component_names import ComponentNames
 from ssmppl.language.model.executions import Execution, this_execution
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
@@ -55,6 +56,9 @@ class Model:
         that name in the data goes before.
     time_unit : of the time step where the times are dates: "s", "min", "h" or "D". Numbers are
         taken as they are.
+    dims : names of the axes of vectors and matrices, by quantity (``{"effect": ["season"]}``),
+        which results have in place of `effect_dim_0`.
+    coords : the labels of the components along such a dim (``{"season": ["winter", ...]}``).
 
     Examples
     --------
@@ -77,6 +81,8 @@ class Model:
     def __init__(
         self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int | None] = (),
         time_step: str | None = None, time_unit: str = "s",
+        coords: Mapping[str, Iterable[Any]] | None = None,
+        dims: Mapping[str, str | Iterable[str]] | None = None,
     ):  # fmt: skip
         self.location = user_location()
         if not isinstance(name, str):
@@ -117,6 +123,7 @@ class Model:
                 fix="name each input once",
                 where=self.location,
             )
+        self.component_names = ComponentNames.of(dims, coords, self.location)
         self.name = name
         self.inputs: dict[str, tuple[int, ...]] = {
             key: () if length is None else (int(length),) for key, length in pairs
@@ -302,7 +309,8 @@ class Model:
         variable that one reads from outside gets another value."""
         functions = [f for role in ROLES for f in self.functions[role]]
         outer = digest_of_code(functions)
-        return (self.name, tuple(self.inputs.items()), *map(tuple, self.functions.values()), outer)
+        own = (self.name, tuple(self.inputs.items()), self.component_names)
+        return (*own, *map(tuple, self.functions.values()), outer)
 
     def __repr__(self) -> str:
         declared = ", ".join(

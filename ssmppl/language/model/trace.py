@@ -32,6 +32,7 @@ from ssmppl.errors import Location
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.language.distributions import Distribution
+from ssmppl.language.model.component_names import ComponentNames
 from ssmppl.language.model.pickling import UnpackedCache, digest_of, packed, unpacked
 
 
@@ -68,6 +69,7 @@ class Trace:
     auxiliary : names of the states that are draws of a step: read by later distributions of the
         same step only. At the first row, where no step has led to, they are 0.
     time_step : the input that is the time to the next row, and its unit where times are dates.
+    component_names : of vectors and matrices, in results.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Trace:
     choices: dict[Expr, tuple[Expr, int]] = field(default_factory=dict)
     auxiliary: frozenset[str] = frozenset()
     time_step: tuple[str, str] | None = None
+    component_names: ComponentNames = field(default_factory=ComponentNames)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Packed once, and one object in each process that gets it: what was generated for it is
@@ -104,6 +107,11 @@ class Trace:
     @cached_property
     def state_prev_symbols(self) -> list[Expr]:
         return [previous(s) for s in self.state_symbols]
+
+    def label(self, s: Expr) -> str:
+        """A component as results call it: `effect[winter]`; by its numbers where it has no name."""
+        _, name, index = s.data
+        return self.component_names.label(name, index)
 
     @property
     def approximations(self) -> dict[str, str]:
