@@ -10,9 +10,8 @@ import datetime
 import json
 import os
 import platform
-import re
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = [
     "arviz",
     "save",
-    "time_axes",
     "to_dataset",
     "to_inference_data",
 ]
@@ -54,6 +52,7 @@ def to_inference_data(
     dims: Mapping[str, Sequence[str]] | None = None,
     coords: Mapping[str, Any] | None = None,
     renamed: Mapping[str, str] | None = None,
+    further: Mapping[str, tuple[Sequence[str], np.ndarray, Mapping[str, Any]]] | None = None,
     attrs: Mapping[str, Any] | None = None,
 ) -> Any:
     """ArviZ InferenceData of a run; under ArviZ 1.x an `xarray.DataTree` with the same groups.
@@ -81,6 +80,8 @@ def to_inference_data(
         Values of further coordinates, by dim.
     renamed
         Other names of dims that follow from the names of variables: `x_dim_0`.
+    further
+        Coordinates that are no dims, with their dims and attributes: in each group that has these.
     attrs
         What the run was. Made fit for netCDF (see `netcdf_attributes`), and written on the whole
         and on every group of draws.
@@ -109,6 +110,7 @@ def to_inference_data(
             dims=dims or {},
             coords=coords or {},
             renamed=renamed or {},
+            further=further or {},
             attrs={} if group in fixed else written,
         )
     return _container(groups, written)
@@ -147,6 +149,7 @@ def to_dataset(
         dims=dims or {},
         coords=coords or {},
         renamed=renamed or {},
+        further={},
         attrs=_provenance() | netcdf_attributes(attrs or {}),
     )
 
@@ -180,13 +183,6 @@ def arviz() -> Any:
         warnings.simplefilter("ignore", FutureWarning)
         import arviz
     return arviz
-
-
-def time_axes(dims: Iterable[Any]) -> list[str]:
-    """Those of some dims that rows lie along: `time`, or `time_1`, `time_2`, ... by experiment."""
-    numbers = {str(d): re.fullmatch(r"time(?:_(\d+))?", str(d)) for d in dims}
-    found = {d: int(match[1] or 0) for d, match in numbers.items() if match}
-    return sorted(found, key=lambda d: found[d])
 
 
 def netcdf_attributes(attrs: Mapping[str, Any]) -> dict[str, Any]:
@@ -252,6 +248,7 @@ def _dataset(
     dims: Mapping[str, Sequence[str]],
     coords: Mapping[str, Any],
     renamed: Mapping[str, str],
+    further: Mapping[str, tuple[Sequence[str], np.ndarray, Mapping[str, Any]]],
     attrs: Mapping[str, Any],
 ) -> xr.Dataset:
     import xarray as xr
@@ -277,7 +274,7 @@ def _dataset(
                 )
         arrays[name] = (labels, array)
 
-    coordinates: dict[str, np.ndarray] = {
+    coordinates: dict[str, Any] = {
         dim: np.arange(size) for dim, (size, _) in sizes.items() if dim in sample_dims
     }
     if "time" in sizes:
@@ -288,6 +285,9 @@ def _dataset(
             coordinates[dim] = _labels(coords[dim])
         elif dim not in coordinates:
             coordinates[dim] = np.arange(size)
+    for name, (own, values, about) in further.items():
+        if set(own) <= set(sizes):
+            coordinates[name] = (list(own), _labels(values), dict(about))
     return xr.Dataset(arrays, coords=coordinates, attrs=dict(attrs))
 
 

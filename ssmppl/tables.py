@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
-from ssmppl.results import arviz, time_axes
+from ssmppl.results import arviz
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,7 +49,7 @@ def summary(idata: Any, var_names: str | Iterable[str] | None = None) -> pd.Data
 
     posterior = _posterior(idata)
     if var_names is None:
-        names = [name for name, v in posterior.data_vars.items() if not time_axes(v.dims)]
+        names = [name for name, v in posterior.data_vars.items() if "time" not in v.dims]
     else:
         names = [var_names] if isinstance(var_names, str) else list(var_names)
         unknown = [name for name in names if name not in posterior.data_vars]

@@ -162,14 +162,17 @@ def test_time_coordinate_survives(arrays, time, tmp_path):
 def test_dims_of_single_variables():
     wheels = np.random.default_rng(2).normal(size=(2, 5, 2))
     idata = results.to_inference_data(
-        posterior={"x_1": np.zeros((2, 5, 4)), "x_2": np.zeros((2, 5, 6)), "b": wheels},
-        dims={"x_1": ["time_1"], "x_2": ["time_2"], "b": ["wheel"]},
-        coords={"time_1": [1900, 1901, 1902, 1903], "wheel": ["left", "right"]},
+        posterior={"x": np.zeros((2, 5, 3, 4)), "b": wheels},
+        dims={"x": ["experiment", "time"], "b": ["wheel"]},
+        coords={"experiment": ["a", "b", "c"], "wheel": ["left", "right"]},
+        further={"rows": (["experiment"], np.array([4, 4, 2]), {"unit": "1"})},
+        time=[1900, 1901, 1902, 1903],
     )
     posterior = idata["posterior"]
-    assert posterior["x_1"].dims == ("chain", "draw", "time_1")
-    assert posterior["time_1"].values.tolist() == [1900, 1901, 1902, 1903]
-    assert posterior["time_2"].values.tolist() == [0, 1, 2, 3, 4, 5]
+    assert posterior["x"].dims == ("chain", "draw", "experiment", "time")
+    assert posterior["time"].values.tolist() == [1900, 1901, 1902, 1903]
+    assert posterior["rows"].values.tolist() == [4, 4, 2]
+    assert posterior["rows"].attrs == {"unit": "1"}
     assert posterior["wheel"].values.tolist() == ["left", "right"]
     assert list(tables.summary(idata).index) == ["b[left]", "b[right]"]
 

@@ -44,9 +44,9 @@ from ssmppl.cli.rendering import (
     write,
     wrote,
 )
+from ssmppl.data.experiments import experiments_of
 from ssmppl.errors import DataError
 from ssmppl.modelfile import load_model, parse_assignments
-from ssmppl.results import time_axes
 from ssmppl.tables import wide_table
 
 __all__ = ["forecast", "leave_future_out", "predict"]
@@ -100,10 +100,11 @@ def predict(
     count = drawn.sizes["chain"] * drawn.sizes["draw"]
     heading(f"{loaded.name}: {count} draws from the {group.replace('_', ' ')} distribution")
     experiments = []
-    for axis in time_axes(drawn.dims):
-        time = drawn[axis].values
-        mark = axis.removeprefix("time")  # that follows the names of one of several experiments
-        own = {str(n).removesuffix(mark): v for n, v in drawn.data_vars.items() if axis in v.dims}
+    for label, one in experiments_of(drawn):
+        time = one["time"].values
+        own = {str(n): v for n, v in one.data_vars.items() if "time" in v.dims}
+        if label:
+            say(f"Experiment {label}")
         spreads = spread(own, ("chain", "draw"))
         say(table_text(spread_table(spreads, time)))
         experiments.append({"time": time, "observations": spreads})

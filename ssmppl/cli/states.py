@@ -36,6 +36,7 @@ from ssmppl.cli.rendering import (
 )
 from ssmppl.inference.gaussian.likelihood import APPROXIMATE
 from ssmppl.inference.gaussian.moments import NAMES
+from ssmppl.inference.run.labels import as_list
 from ssmppl.inference.verbs.smooth import NAMES as SMOOTHERS
 from ssmppl.modelfile import load_model, parse_assignments
 from ssmppl.tables import state_table
@@ -142,7 +143,7 @@ def _filtered(
     given = parse_assignments(parameters, "--parameters")
     loaded = load_model(model)
     found = verb(loaded, read_data(data), given, **settings)
-    datasets = found if isinstance(found, list) else [found]
+    datasets = as_list(found)
     experiments, files, paths = [], [], numbered(path, len(datasets))
     for i, dataset in enumerate(datasets, start=1):
         total = dataset["log_likelihood_increment"].sum("time").values
@@ -230,7 +231,7 @@ def smooth(
         loaded, read_data(data), given, method, particles=particles, trajectories=trajectories,
         proposal=proposal, quantiles=quantiles, seed=seed,
     )  # fmt: skip
-    datasets = found if isinstance(found, list) else [found]
+    datasets = as_list(found)
     experiments, files, paths = [], [], numbered(path, len(datasets))
     for i, dataset in enumerate(datasets, start=1):
         attrs = dataset.attrs

@@ -40,6 +40,7 @@ class Experiment:
     partial : names of channels that are partly measured in some row.
     observed, inputs : by name, in the user's shapes (T, ...), NaN for missing.
     zone : name of the zone that the labels, in UTC, were given in; empty where there is none.
+    label : what the user calls the experiment; None where it has no name.
     """
 
     y: np.ndarray
@@ -51,6 +52,7 @@ class Experiment:
     observed: dict[str, np.ndarray]
     inputs: dict[str, np.ndarray]
     zone: str = ""
+    label: Any = None
 
 
 def bind(
@@ -60,7 +62,8 @@ def bind(
 
     Parameters
     ----------
-    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset; a list or a dictionary of those, a
+        table with the model's column `experiment`, or a Dataset with that dim.
     need_observations : False where channels may be left out (predictions): all missing then.
     steps : number of rows, where there is nothing in `data` to tell it, or to check it by.
 
@@ -77,7 +80,7 @@ def bind(
         {n: site.distribution.support() for n, site in trace.observations.items()},
         tuple(_needed(trace)),
     )
-    given = [with_time_step(trace, s) for s in sources(data, named)]
+    given = [with_time_step(trace, s) for s in sources(data, named, by=trace.experiment)]
     return [_bind(trace, s, need_observations, steps, common) for s in given]
 
 
@@ -85,7 +88,9 @@ def unread(trace: Trace, data: Any) -> list[str]:
     """The columns that neither are named as an observation or input of the model nor begin with
     such a name and `[` or `_`, as the components of vectors do."""
     named = [*trace.observations, *trace.inputs]
-    columns = dict.fromkeys(str(c) for s in sources(data, named) for c in s.columns)
+    columns = dict.fromkeys(
+        str(c) for s in sources(data, named, by=trace.experiment) for c in s.columns
+    )
     parts = tuple(f"{n}{mark}" for n in named for mark in "[_")
     return [c for c in columns if c not in (*named, "time") and not c.startswith(parts)]
 
@@ -179,6 +184,7 @@ def _bind(
         observed={n: observed[n] for n in trace.observations},
         inputs=inputs,
         zone=source.zone,
+        label=source.experiment,
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.data.experiments import is_dataset, is_table, split
 from ssmppl.data.times import as_dates, label_text
 from ssmppl.data.values import Fault, as_numbers, short
 from ssmppl.errors import DataError
@@ -27,6 +28,7 @@ class Source:
     label : "data", or "data set 2" where there are several, with the name of its file if known.
     time : labels of the rows, None where the data have none; of dates with a zone those of UTC.
     zone : name of the zone that dates were given in; empty where they have none.
+    experiment : what the user calls it; None where it has no name.
     """
 
     label: str
@@ -35,6 +37,7 @@ class Source:
     time: np.ndarray | None = None
     time_name: str = "time"
     zone: str = ""
+    experiment: Any = None
     known: list[str] = field(default_factory=list)
 
     def place(
@@ -59,24 +62,30 @@ class Source:
         return f" ({self.time_name} {label_text(self.time[row])})"
 
 
-def sources(data: Any, named: Iterable[str], argument: str = "data") -> list[Source]:
-    """The data sets in `data`; `named` are the quantities of the model that data may hold."""
+def sources(
+    data: Any, named: Iterable[str], argument: str = "data", by: str | None = None
+) -> list[Source]:
+    """The data sets in `data`; `named` are the quantities of the model that data may hold, `by` the
+    column that tells experiments apart."""
     named = list(named)
-    if isinstance(data, (list, tuple)) and not _is_table(data):
-        if not data:
-            raise DataError(
-                f"{argument} is an empty list of data sets",
-                fix="give at least one data set; a single one needs no list",
-            )
+    if isinstance(data, (list, tuple)) and data:
         if all(isinstance(d, (int, float, np.number)) or d is None for d in data):
             raise _not_a_data_set(data, argument, argument, named)
-        return [
-            _source(
-                d, f"{argument} set {i}{_file(d)}" if len(data) > 1 else argument, argument, named
-            )
-            for i, d in enumerate(data, start=1)
-        ]
-    return [_source(data, argument, argument, named)]
+    parts = split(data, named, by, argument)
+    if parts is None:
+        return [_source(data, argument, argument, named)]
+    if not parts:
+        raise DataError(
+            f"{argument} is an empty list of data sets",
+            fix="give at least one data set; a single one needs no list",
+        )
+    out = []
+    for i, (label, one) in enumerate(parts, start=1):
+        which = f"{argument} set {i}{_file(one)}" if len(parts) > 1 else argument
+        which = which if label is None else f"experiment {label!r}"
+        out.append(_source(one, which, argument, named))
+        out[-1].experiment = label
+    return out
 
 
 def _file(data: Any) -> str:
@@ -91,17 +100,13 @@ def _source(data: Any, label: str, argument: str, named: list[str]) -> Source:
         data = data.to_frame()
     elif hasattr(data, "to_dataset") and getattr(data, "name", None) in named:
         data = data.to_dataset()
-    if hasattr(data, "data_vars") and hasattr(data, "coords"):
+    if is_dataset(data):
         return _from_dataset(data, label)
-    if _is_table(data):
+    if is_table(data):
         return _from_frame(data, label, named)
     if isinstance(data, Mapping):
         return _from_mapping(data, label, named)
     raise _not_a_data_set(data, label, argument, named)
-
-
-def _is_table(data: Any) -> bool:
-    return hasattr(data, "iloc") and hasattr(data, "columns")
 
 
 def _is_series(data: Any) -> bool:
@@ -184,8 +189,8 @@ def _from_frame(data: Any, label: str, named: list[str]) -> Source:
     if getattr(data.index, "nlevels", 1) > 1:
         raise DataError(
             "the rows have an index of several levels",
-            fix="one data set holds one experiment: pass a list, "
-            "[part.droplevel(0) for _, part in data.groupby(level=0)]",
+            fix="where a level tells experiments apart, name it in the model: "
+            f"ssm.Model(..., experiment={str(data.index.names[0])!r}); else data.reset_index()",
             where=source.place(),
         )
     column = "time" in names and "time" not in named
@@ -313,8 +318,9 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
             raise DataError(
                 f"the {name} {label_text(labels[row])} stands in rows {first[value] + 1} "
                 f"and {row + 1}",
-                fix="one data set holds one experiment with one row for each time: remove the "
-                "repetition, or pass a list of data sets for several experiments",
+                fix="one experiment has one row for each time: remove the repetition; or, of "
+                "several experiments, name the column that tells them apart, "
+                'ssm.Model(..., experiment="id"), or pass a dictionary or a list of data sets',
                 where=where,
             )
         first[value] = row

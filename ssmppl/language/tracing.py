@@ -127,6 +127,7 @@ class _Tracer:
             proposal=proposal,
             inputs=dict(model.inputs),
             time_step=model.time_step,
+            experiment=model.experiment,
             component_names=model.component_names,
             locations=locations,
             functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},

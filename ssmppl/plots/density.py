@@ -15,7 +15,6 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace
 from ssmppl.language.tracing import trace
 from ssmppl.plots.reading import components
-from ssmppl.results import time_axes
 
 __all__ = ["Prior", "estimated", "prior_draws", "priors_of", "supports", "window"]
 
@@ -150,7 +149,7 @@ def prior_draws(dataset: Any) -> dict[str, Prior]:
     """The priors of a group of draws from them."""
     found: dict[str, Prior] = {}
     for name, variable in dataset.data_vars.items():
-        if not time_axes(variable.dims):
+        if "time" not in variable.dims:
             values = variable.transpose("chain", "draw", ...).values
             flat = values.reshape(-1, *values.shape[2:])
             found |= {k: Prior(draws=v) for k, v in components(str(name), flat, 1, variable)}

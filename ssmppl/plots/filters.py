@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from ssmppl.drawing.style import DATA, FAINT, MAIN, OTHER, bare
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.plots.drawing import few, handed, key, only_below, panels, shown_time, styled
-from ssmppl.plots.reading import components, is_dataset, pick, wrong_kind
+from ssmppl.plots.reading import components, experiment_name, is_dataset, pick, wrong_kind
 
 __all__ = ["plot_ancestry", "plot_filter"]
 
@@ -29,7 +30,10 @@ def filtered(result: Any, verb: str) -> list[Any]:
     ------
     ArgumentError : some of it is no result of a filter.
     """
-    found = list(result) if isinstance(result, (list, tuple)) else [result]
+    if isinstance(result, Mapping) and not is_dataset(result):
+        found = list(result.values())
+    else:
+        found = list(result) if isinstance(result, (list, tuple)) else [result]
     for one in found:
         if not is_dataset(one) or "log_likelihood_increment" not in one:
             raise wrong_kind(verb, one, FILTERED)
@@ -38,8 +42,11 @@ def filtered(result: Any, verb: str) -> list[Any]:
     return found
 
 
-def titles(count: int) -> list[str]:
-    """Names of the experiments; empty where there is only one."""
+def titles(result: Any) -> list[str]:
+    """Names of the experiments of a filter's result; empty where there is only one."""
+    if isinstance(result, Mapping) and not is_dataset(result):
+        return [experiment_name(str(k)) for k in result]
+    count = len(result) if isinstance(result, (list, tuple)) else 1
     return [f"experiment {k}" for k in range(1, count + 1)] if count > 1 else [""]
 
 
@@ -74,7 +81,7 @@ def plot_filter(result: Any, *, ax: Any = None) -> Any:
     sizes = "ess" in found[0]
     axes = panels("plot_filter", 1 + sizes, len(found), ax, height=1.8,
                   width=max(8.0, 3.0 * len(found)))  # fmt: skip
-    for one, column, title in zip(found, axes.T, titles(len(found)), strict=True):
+    for one, column, title in zip(found, axes.T, titles(result), strict=True):
         notes = [title] * bool(title)
         if sizes:
             notes.append(_sizes(one, column[0]))

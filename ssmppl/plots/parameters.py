@@ -16,7 +16,6 @@ from ssmppl.language.model.model import Model
 from ssmppl.plots.density import Prior, estimated, prior_draws, priors_of, window
 from ssmppl.plots.drawing import few, handed, key, multiples, only_below, styled
 from ssmppl.plots.reading import components, group_of, is_inference_data, pick, wrong_kind
-from ssmppl.results import time_axes
 
 __all__ = ["parameter_draws", "plot_maximization", "plot_prior_posterior"]
 
@@ -35,7 +34,7 @@ def parameter_draws(idata: Any, verb: str) -> dict[str, np.ndarray]:
     posterior = group_of(verb, idata, "posterior", "give what ssm.sample returns")
     found: dict[str, np.ndarray] = {}
     for name, variable in posterior.data_vars.items():
-        if not time_axes(variable.dims):
+        if "time" not in variable.dims:
             values = variable.transpose("chain", "draw", ...).values
             found |= components(str(name), np.asarray(values, dtype=float), 2, variable)
     if not found:

@@ -13,12 +13,10 @@ from ssmppl.plots.drawing import dots, fan, few, handed, key, only_below, panels
 from ssmppl.plots.filters import filtered, titles
 from ssmppl.plots.reading import (
     Record,
-    bands,
     components,
-    data_of,
+    drawn_of,
     is_inference_data,
     is_prediction,
-    over_time,
     pick,
     quantiles_at_levels,
     wrong_kind,
@@ -101,7 +99,7 @@ def _of_filter(result: Any) -> tuple[list[Record], list[dict[str, np.ndarray]]]:
     """Bands and data, and PIT values, of each experiment."""
     found = filtered(result, "plot_predictions")
     records, pits = [], []
-    for one, title in zip(found, titles(len(found)), strict=True):
+    for one, title in zip(found, titles(result), strict=True):
         own = one.isel(draw=0)
         states: dict[str, np.ndarray] = {}
         data: dict[str, np.ndarray] = {}
@@ -131,19 +129,8 @@ def _drawn(idata: Any) -> list[Record]:
     names = [n for n in PREDICTIVE if group(idata, n) is not None]
     if not names:
         raise wrong_kind("plot_predictions", idata, WANTED)
-    drawn, found = group(idata, names[0]), []
-    for mark, axis in over_time(drawn):
-        states: dict[str, np.ndarray] = {}
-        for name, variable in drawn.data_vars.items():
-            if axis in variable.dims:
-                values = variable.transpose("chain", "draw", axis, ...).values
-                plain = str(name).removesuffix(mark) if mark else str(name)
-                flat = values.reshape(-1, *values.shape[2:])
-                states |= {k: bands(v) for k, v in components(plain, flat, 2, variable)}
-        data = data_of(group(idata, "observed_data"), mark, axis)
-        title = f"experiment {mark[1:]}" if mark else ""
-        found.append(Record(title, drawn[axis].values, states, data, mark=mark))
-    if not found:
+    found = drawn_of(idata, group(idata, names[0]))
+    if not found[0].states:
         raise ArgumentError(f"the group {names[0]!r} has no variable over time", fix=WANTED)
     return found
 

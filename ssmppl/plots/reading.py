@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from ssmppl.data.experiments import experiments_of
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.inference.verbs.predict import group
-from ssmppl.results import time_axes
 from ssmppl.tables import quantiles_of
 
 __all__ = [
@@ -25,12 +25,13 @@ __all__ = [
     "bands",
     "components",
     "data_of",
+    "drawn_of",
+    "experiment_name",
     "group_of",
     "is_dataset",
     "is_inference_data",
     "is_prediction",
     "observed_states",
-    "over_time",
     "pick",
     "quantiles_at_levels",
     "records",
@@ -46,7 +47,7 @@ STATES_FROM = "give what ssm.sample(..., states=True), ssm.smooth or a filter re
 class Record:
     """One experiment as it is drawn (T rows); all names are those of scalars, as `x[0]`.
 
-    name : "experiment 2"; "" where there is one only. mark : what follows its names in groups.
+    name : of the experiment, "experiment 2" by its number; "" where there is one only.
     time : (T,) labels. states : quantiles (5, T) at `LEVELS`. data, inputs : (T,), NaN if missing.
     observes : of a component of the data, the state that is its mean.
     """
@@ -57,7 +58,6 @@ class Record:
     data: dict[str, np.ndarray] = field(default_factory=dict)
     inputs: dict[str, np.ndarray] = field(default_factory=dict)
     observes: dict[str, str] = field(default_factory=dict)
-    mark: str = ""
 
 
 def is_inference_data(result: Any) -> bool:
@@ -142,11 +142,6 @@ def pick(labels: Iterable[str], var_names: Any, what: str) -> list[str]:
     return found
 
 
-def over_time(dataset: Any) -> list[tuple[str, str]]:
-    """(mark, dim over time) of each experiment: ("", "time"), or ("_1", "time_1"), ..."""
-    return [(axis.removeprefix("time"), axis) for axis in time_axes(dataset.dims)]
-
-
 def bands(draws: np.ndarray) -> np.ndarray:
     """(5, ...) quantiles at `LEVELS` of draws along the first axis."""
     return quantiles_of(draws, LEVELS)
@@ -159,15 +154,19 @@ def observed_states(attrs: Any) -> dict[str, str]:
     return {str(k): str(v) for k, v in found.items()}
 
 
-def data_of(dataset: Any, mark: str, axis: str) -> dict[str, np.ndarray]:
+def data_of(dataset: Any) -> dict[str, np.ndarray]:
     """Scalars (T,) of one experiment in a group of data; none where there is no group."""
     found: dict[str, np.ndarray] = {}
     for name, variable in {} if dataset is None else dataset.data_vars.items():
-        if axis in variable.dims:
-            plain = str(name).removesuffix(mark) if mark else str(name)
-            values = np.asarray(variable.transpose(axis, ...).values, dtype=float)
-            found |= components(plain, values, 1, variable)
+        if "time" in variable.dims:
+            values = np.asarray(variable.transpose("time", ...).values, dtype=float)
+            found |= components(str(name), values, 1, variable)
     return found
+
+
+def experiment_name(label: str) -> str:
+    """What an experiment is called over a panel: its label, "experiment 2" for a number."""
+    return f"experiment {label}" if label.isdigit() else label
 
 
 def records(result: Any, verb: str) -> list[Record]:
@@ -179,42 +178,52 @@ def records(result: Any, verb: str) -> list[Record]:
     """
     if is_inference_data(result):
         return _of_posterior(result, verb)
-    several = isinstance(result, (list, tuple))
+    if isinstance(result, Mapping) and not is_dataset(result):
+        each = [(experiment_name(str(k)), one) for k, one in result.items()]
+    elif isinstance(result, (list, tuple)):
+        several = len(result) > 1
+        each = [(f"experiment {k}" if several else "", r) for k, r in enumerate(result, start=1)]
+    else:
+        each = [("", result)]
     found = []
-    for k, one in enumerate(result if several else [result], start=1):
+    for name, one in each:
         if not is_dataset(one):
             raise wrong_kind(verb, one, STATES_FROM)
-        name = f"experiment {k}" if several and len(result) > 1 else ""
         found.append(_of_dataset(one, name, verb))
     if not found:
         raise ArgumentError(f"{verb} was given an empty list", fix=STATES_FROM)
     return found
 
 
-def _of_posterior(idata: Any, verb: str) -> list[Record]:
-    posterior = group_of(verb, idata, "posterior", STATES_FROM)
+def drawn_of(idata: Any, drawn: Any) -> list[Record]:
+    """Bands of the draws of a group, with the data, of each experiment."""
+    groups = [group(idata, name) for name in ("observed_data", "constant_data")]
+    data = [[one for _, one in experiments_of(g)] if g is not None else [] for g in groups]
     found = []
-    several = over_time(posterior)
-    for mark, axis in several:
+    for i, (label, own) in enumerate(experiments_of(drawn)):
         states: dict[str, np.ndarray] = {}
-        for name, variable in posterior.data_vars.items():
-            if axis in variable.dims:
-                values = variable.transpose("chain", "draw", axis, ...).values
+        for name, variable in own.data_vars.items():
+            if "time" in variable.dims:
+                values = variable.transpose("chain", "draw", "time", ...).values
                 flat = values.reshape(-1, *values.shape[2:])
-                plain = str(name).removesuffix(mark) if mark else str(name)
-                states |= {k: bands(v) for k, v in components(plain, flat, 2, variable)}
+                states |= {k: bands(v) for k, v in components(str(name), flat, 2, variable)}
         found.append(
             Record(
-                f"experiment {mark[1:]}" if mark else "",
-                posterior[axis].values,
+                experiment_name(label),
+                own["time"].values if states else np.arange(0),
                 states,
-                data_of(group(idata, "observed_data"), mark, axis),
-                data_of(group(idata, "constant_data"), mark, axis),
-                observed_states(posterior.attrs),
-                mark,
+                data_of(data[0][i] if data[0] else None),
+                data_of(data[1][i] if data[1] else None),
+                observed_states(drawn.attrs),
             )
         )
-    if not found or not found[0].states:
+    return found
+
+
+def _of_posterior(idata: Any, verb: str) -> list[Record]:
+    posterior = group_of(verb, idata, "posterior", STATES_FROM)
+    found = drawn_of(idata, posterior)
+    if not found[0].states:
         raise ArgumentError(
             f"the posterior holds no states, only {listing('', map(str, posterior.data_vars))}",
             fix="sample with states=True and a method that draws them, or give what ssm.smooth "

@@ -26,6 +26,7 @@ from ssmppl.plots.reading import (
     Record,
     bands,
     components,
+    experiment_name,
     is_dataset,
     is_inference_data,
     pick,
@@ -179,12 +180,12 @@ def _before(idata: Any, result: Any) -> Record:
     if not is_inference_data(idata) or group(idata, "posterior") is None:
         raise wrong_kind("plot_forecast", idata, "as the second argument give what ssm.sample "
                          "returned, or leave it out")  # fmt: skip
-    number = int(result.attrs.get("experiment", 1))
-    found = [r for r in records(idata, "plot_forecast") if r.mark in ("", f"_{number}")]
+    which = experiment_name(str(result.attrs.get("experiment", 1)))
+    found = [r for r in records(idata, "plot_forecast") if r.name in ("", which)]
     if not found or len(found[0].time) != int(result.attrs["after"]):
         rows = ", ".join(str(len(r.time)) for r in records(idata, "plot_forecast"))
         raise ArgumentError(
-            f"the forecast follows {int(result.attrs['after'])} rows of experiment {number}, and "
+            f"the forecast follows {int(result.attrs['after'])} rows of {which}, and "
             f"the posterior is of {rows} rows",
             fix="give the posterior that the forecast was made from",
         )

@@ -160,8 +160,8 @@ def test_several_files_are_several_experiments(series):
     run("simulate", "walk.py", "--steps", 12, "-p", "q=0.3", "--seed", 2, "-o", "other.csv")
     run("sample", "walk.py", series, "other.csv", *QUICK, "-o", "post.nc")
     posterior = arviz().from_netcdf("post.nc")["posterior"]
-    assert posterior["x_1"].shape == (2, 30, 20)
-    assert posterior["x_2"].shape == (2, 30, 12)
+    assert posterior["x"].shape == (2, 30, 2, 20)
+    assert posterior["rows"].values.tolist() == [20, 12]
 
 
 @pytest.mark.parametrize("header", ["time,y", ",y", "Unnamed: 0,y"])

@@ -55,7 +55,7 @@ class LaterCase(Case):
             for n, length in self.recipe.inputs.items()
         }
         given = {"steps": steps} if not inputs or self.rng.random() < self.odd else {}
-        if "time_1" in idata["posterior"].dims or self.rng.random() < self.odd:  # of several
+        if "experiment" in idata["posterior"].dims or self.rng.random() < self.odd:  # of several
             given["experiment"] = 1
         found = ssm.forecast(self.model, idata, inputs=inputs or None, seed=1, **given)
         self.drawn(ssm.plot_forecast, found, idata)

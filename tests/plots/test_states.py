@@ -116,8 +116,8 @@ def test_several_experiments_stand_side_by_side_each_on_its_own_time():
     assert axes.shape == (3, 2)
     assert [ax.get_title(loc="left") for ax in axes[0]] == ["experiment 1", "experiment 2"]
     posterior = sampled(True)["posterior"]
-    for k, (mark, steps) in enumerate((("_1", 12), ("_2", 11))):
-        draws = posterior[f"x{mark}"].values[..., 0].reshape(-1, steps)
+    for k, steps in enumerate((12, 11)):
+        draws = posterior["x"].values[:, :, k, :steps, 0].reshape(-1, steps)
         ((line, drawn),) = fans(axes[0, k], None)
         np.testing.assert_allclose(drawn, np.quantile(draws, LEVELS, axis=0))
         np.testing.assert_array_equal(dots(axes[2, k])[0].get_ydata(), data(k)["y"].dropna())

@@ -1,19 +1,23 @@
 """Names, dims and coordinates of what belongs to an experiment.
 
-Of a single one `y` over `time`; of several `y_1` over `time_1`, `y_2` over `time_2`, as their
-lengths differ.
+Of a single one `y` over `time`; of several `y` over `experiment` and `time`, NaN after the end of a
+shorter one. The coordinate `rows` (experiment) says how many rows each has; where their rows are
+labelled differently `time` counts them, and `times` (experiment, time) are the labels.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.data.experiments import EXPERIMENT, ROWS, TIMES, WHOLE
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.language.model.trace import Trace
@@ -40,6 +44,25 @@ def component_dims(name: str, values: np.ndarray, leading: int) -> list[str]:
     """Dims of the components of a state, channel or input, whatever quantity it is:
     what has the same dims can be added, and is not spread out into a table."""
     return [f"{name}_dim_{k}" for k in range(values.ndim - leading)]
+
+
+def by_experiment(
+    experiments: Sequence[Experiment], results: Sequence[xr.Dataset]
+) -> xr.Dataset | list[xr.Dataset] | dict[Any, xr.Dataset]:
+    """The results of each experiment as they are handed out: one alone, by label, or in a list."""
+    if len(results) == 1:
+        return results[0]
+    labels = [e.label for e in experiments]
+    return list(results) if None in labels else dict(zip(labels, results, strict=True))
+
+
+def as_list(
+    results: xr.Dataset | list[xr.Dataset] | dict[Any, xr.Dataset],
+) -> list[xr.Dataset]:
+    """What `by_experiment` handed out, one after the other."""
+    if isinstance(results, dict):
+        return list(results.values())
+    return results if isinstance(results, list) else [results]
 
 
 def model_attributes(trace: Trace) -> dict[str, Any]:
@@ -69,71 +92,120 @@ def observes(trace: Trace) -> dict[str, str]:
     return found
 
 
-def zone_of(attrs: Mapping[str, Any], axis: str) -> str:
-    """The zone that the labels of a dim were given in, by the attributes of a result."""
+def zone_of(attrs: Mapping[str, Any], i: int) -> str:
+    """The zone that the labels of experiment i were given in, by the attributes of a result."""
     found = attrs.get(TIME_ZONES, {})
-    return str((json.loads(found) if isinstance(found, str) else found).get(axis, ""))
+    return str((json.loads(found) if isinstance(found, str) else found).get(str(i + 1), ""))
 
 
-def check_names(trace: Trace, experiments: Sequence[Experiment], states: bool = True) -> None:
-    """Refuse a parameter called as results call what belongs to one of several experiments.
-
-    states : whether these are in the results.
+def check_names(trace: Trace, experiments: Sequence[Experiment]) -> None:
+    """Refuse a parameter called as the dims that results of several experiments have.
 
     Raises
     ------
-    ModelError : there is one, `x_1` beside the state `x`.
+    ModelError : there is one.
     """
-    numbers = range(1, len(experiments) + 1) if len(experiments) > 1 else ()
-    roles: dict[str, Iterable[str]] = {
-        "state": trace.initial if states else (), "observation": trace.observations,
-        "input": trace.inputs, "dimension": ("time",),
-    }  # fmt: skip
     for name, site in trace.parameters.items():
-        for role, known in roles.items():
-            for own in known:
-                k = next((k for k in numbers if name == f"{own}_{k}"), None)
-                if k is not None:
-                    raise ModelError(
-                        f"{name!r} is a parameter, and in results of several data sets the "
-                        f"{role} {own!r} of the {k}. of them",
-                        fix=f"rename the parameter, as {own}_first: no number may follow `{own}_`",
-                        where=site.distribution.location,
-                    )
+        if len(experiments) > 1 and name in (EXPERIMENT, ROWS, TIMES):
+            raise ModelError(
+                f"{name!r} is a parameter, and in results of several data sets a dimension or its "
+                "labels",
+                fix=f"rename the parameter, as {name}_",
+                where=site.distribution.location,
+            )
 
 
 class Labels:
-    """dims, coords : of the variables named so far, for `to_inference_data`. attrs : the zones that
-    dates were given in, by the dim over time, where they have any; dates themselves are in UTC."""
+    """What results of these experiments are labelled by, for `to_inference_data`.
+
+    dims : of the variables named so far, where there are several. coords, further : labels by dim,
+    and those of two dims, with these. renamed : names of the components. attrs : the zones that
+    dates were given in, by the number of the experiment; dates themselves are in UTC.
+    """
 
     def __init__(self, trace: Trace, experiments: Sequence[Experiment]):
         self.renamed = trace.component_names.renamed
-        self.several = len(experiments) > 1
-        self.time = None if self.several else experiments[0].time
-        self.dims: dict[str, list[str]] = {}
         self.coords: dict[str, Any] = dict(trace.component_names.coords)
-        zones = {self.axis(i): e.zone for i, e in enumerate(experiments) if e.zone}
+        self.several, self.rows = len(experiments) > 1, [e.steps for e in experiments]
+        self.dims: dict[str, list[str]] = {}
+        self.further: dict[str, tuple[list[str], np.ndarray, dict[str, Any]]] = {}
+        zones = {str(i): e.zone for i, e in enumerate(experiments, start=1) if e.zone}
         self.attrs = {TIME_ZONES: zones} if zones else {}
+        times = [e.time for e in experiments]
+        alike = all(t is None for t in times) or (
+            all(t is not None for t in times)
+            and all(np.array_equal(t, times[0]) for t in times[1:])  # type: ignore[arg-type]
+        )
+        self.time = times[0] if alike else None
         if self.several:
-            self.coords |= {
-                self.axis(i): np.arange(1, e.steps + 1) if e.time is None else e.time
-                for i, e in enumerate(experiments)
-            }
+            names = [i if e.label is None else e.label for i, e in enumerate(experiments, start=1)]
+            self.coords[EXPERIMENT] = names
+            self.further[ROWS] = ([EXPERIMENT], np.array(self.rows), {})
+            if not alike:
+                own = [np.arange(0) if t is None else t for t in times]
+                whole = all(t.dtype.kind in "iu" for t in own)  # NaN makes floats of them
+                padded = _padded_labels(own, max(self.rows))
+                self.further[TIMES] = ([EXPERIMENT, "time"], padded, {WHOLE: int(whole)})
 
-    def mark(self, i: int) -> str:
-        """What follows the names of experiment i's variables."""
-        return f"_{i + 1}" if self.several else ""
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of `to_inference_data`, once all variables are named."""
+        return {
+            "time": self.time, "dims": self.dims, "coords": self.coords, "renamed": self.renamed,
+            "further": self.further,
+        }  # fmt: skip
 
-    def axis(self, i: int) -> str:
-        """Its dim over time."""
-        return f"time{self.mark(i)}"
+    def together(
+        self, each: Sequence[Mapping[str, Any]], leading: int = 1, missing: float = np.nan
+    ) -> dict[str, np.ndarray]:
+        """Variables of all experiments, by name, of each of which the last of `leading` axes is
+        time: with an axis before it for the experiment, where there are several.
 
-    def named(self, i: int, values: Mapping[str, Any], leading: int = 1) -> dict[str, np.ndarray]:
-        """Variables of experiment i under their names; time is the last of `leading` axes."""
-        named = {f"{n}{self.mark(i)}": v for n, v in values.items()}
-        if self.several:
-            for n, v in named.items():
-                rest = component_dims(n, v, leading)
-                # the log likelihood has none but time
-                self.dims.setdefault(n, [self.axis(i), *rest])
-        return named
+        missing : what stands after the end of a shorter experiment.
+        """
+        if not self.several:
+            return dict(each[0])
+        out: dict[str, np.ndarray] = {}
+        for n, first in each[0].items():
+            rest, before = component_dims(n, first, leading), first.shape[: leading - 1]
+            shape = (*before, len(each), max(self.rows), *first.shape[leading:])
+            out[n] = _room(first, shape)
+            for i, own in enumerate(each):
+                rows = own[n].shape[leading - 1]
+                # by chain, as draws may lie on disk, both those and these
+                for c in range(shape[0]) if before else [slice(None)]:
+                    whole = out[n][c] if before else out[n]
+                    at = (slice(None),) * max(len(before) - 1, 0)
+                    whole[(*at, i, slice(0, rows))] = own[n][c]  # type: ignore[index]
+                    whole[(*at, i, slice(rows, None))] = missing  # type: ignore[index]
+            # a channel's log-likelihood has none but the first two
+            self.dims[n] = max([EXPERIMENT, "time", *rest], self.dims.get(n, []), key=len)
+        return out
+
+
+def _room(like: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Room for numbers of this shape: on disk where `like` is, in a file that goes with them."""
+    owner: Any = like
+    while isinstance(owner, np.ndarray) and not isinstance(owner, np.memmap):
+        owner = owner.base
+    if not isinstance(owner, np.memmap) or not owner.filename:
+        return np.empty(shape)
+    file = tempfile.TemporaryFile(dir=Path(owner.filename).parent)  # noqa: SIM115
+    return np.memmap(file, dtype=float, mode="w+", shape=shape)
+
+
+def _padded_labels(each: Sequence[np.ndarray], rows: int) -> np.ndarray:
+    """Labels of the rows of all experiments, (E, T): dates, numbers or texts, with no date, NaN or
+    an empty text where there are none."""
+    kinds = {t.dtype.kind for t in each if len(t)}
+    if kinds <= {"i", "u", "f"}:
+        out = np.full((len(each), rows), np.nan)
+    elif len(kinds) == 1 and kinds <= {"m", "M"}:
+        dtype = np.result_type(*(t.dtype for t in each if len(t)))
+        out = np.full((len(each), rows), np.array("NaT", dtype=dtype))
+    else:
+        each = [t.astype(str) for t in each]
+        out = np.full((len(each), rows), "", dtype=np.result_type(*each))
+    for i, t in enumerate(each):
+        out[i, : len(t)] = t
+    return out

@@ -26,7 +26,13 @@ from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, full
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
 from ssmppl.inference.run.executors import check_executor
-from ssmppl.inference.run.labels import component_dims, model_attributes, observes, with_data
+from ssmppl.inference.run.labels import (
+    by_experiment,
+    component_dims,
+    model_attributes,
+    observes,
+    with_data,
+)
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
@@ -55,7 +61,7 @@ def particle_filter(
     history: bool = False,
     seed: int | None = None,
     executor: Executor | None = None,
-) -> xr.Dataset | list[xr.Dataset]:
+) -> xr.Dataset | list[xr.Dataset] | dict[Any, xr.Dataset]:
     """Filter means, quantiles, log-likelihood and ESS at given parameters, as a Dataset.
 
     With proposal="twisted" the particles know what comes later: their sum of log-likelihood
@@ -80,7 +86,7 @@ def particle_filter(
 
     Returns
     -------
-    Dataset, or a list of them for several experiments
+    Dataset; of several experiments a list of them, or a dictionary by their labels
         Dims `draw` (one per repeat) and `time`. Variables, for states x and channels y:
 
         * ``x``, ``x_sd``: filter means E[x_t given y_1:t] and standard deviations,
@@ -147,7 +153,7 @@ def particle_filter(
         filter_dataset(problem, e, [run[i] for run in runs], levels, attrs, root)
         for i, e in enumerate(problem.experiments)
     ]
-    return datasets if len(datasets) > 1 else datasets[0]
+    return by_experiment(problem.experiments, datasets)
 
 
 def _one_run(
@@ -270,7 +276,7 @@ def kalman_filter(
     *,
     proposal: str = "auto",
     quantiles: tuple[float, ...] = LEVELS,
-) -> xr.Dataset | list[xr.Dataset]:
+) -> xr.Dataset | list[xr.Dataset] | dict[Any, xr.Dataset]:
     """Run the exact filter of a linear Gaussian model (Kalman 1960), or an approximate one.
 
     Parameters
@@ -287,7 +293,7 @@ def kalman_filter(
 
     Returns
     -------
-    Dataset, or a list of them for several experiments
+    Dataset; of several experiments a list of them, or a dictionary by their labels
         As of `particle_filter`, with one `draw` and without `ess`. Everything is exact with
         "kalman"; else all distributions are Gaussian approximations, and the attribute
         `approximate` is 1.
@@ -331,7 +337,7 @@ def kalman_filter(
     for e in problem.experiments:
         run = _as_run(run_filter(e, theta), e, levels)
         datasets.append(filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess"))
-    return datasets if len(datasets) > 1 else datasets[0]
+    return by_experiment(problem.experiments, datasets)
 
 
 def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> FilterRun:
@@ -368,7 +374,7 @@ def forward_filter(
     *,
     quantiles: tuple[float, ...] = LEVELS,
     seed: int | None = None,
-) -> xr.Dataset | list[xr.Dataset]:
+) -> xr.Dataset | list[xr.Dataset] | dict[Any, xr.Dataset]:
     """Run the exact filter of a model whose states take finitely many values.
 
     The forward algorithm (Rabiner 1989, section III.A), scaled at every step.
@@ -383,7 +389,7 @@ def forward_filter(
 
     Returns
     -------
-    Dataset, or a list of them for several experiments
+    Dataset; of several experiments a list of them, or a dictionary by their labels
         As of `particle_filter`, with one `draw` and without `ess`, everything exact; and for each
         state x ``x_probability``: P(x_t = value given y_1:t), last dim `x_value`, whose coordinate
         holds the values. ``y_predicted_quantile`` inverts the distribution function of the mixture;
@@ -418,7 +424,7 @@ def forward_filter(
         )  # fmt: skip
         dataset = filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess")
         datasets.append(dataset.assign(_probabilities(exact, law, dataset)))
-    return datasets if len(datasets) > 1 else datasets[0]
+    return by_experiment(problem.experiments, datasets)
 
 
 def _probabilities(

@@ -20,15 +20,16 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
+from ssmppl.data.experiments import experiments_of
 from ssmppl.data.parameters import pack, pack_states
 from ssmppl.data.time_steps import lengths
 from ssmppl.data.times import label_text, spacing
-from ssmppl.errors import ArgumentError, warn
+from ssmppl.errors import ArgumentError, listing, warn
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.maximum.estimate import Estimate
-from ssmppl.inference.run.labels import TIME_ZONES, model_attributes, observes, zone_of
+from ssmppl.inference.run.labels import TIME_ZONES, as_list, model_attributes, observes, zone_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.predict import all_draws, group, parameters_of, posterior_of, states_of
@@ -38,7 +39,7 @@ from ssmppl.language.distributions import MvNormal
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.tracing import trace
-from ssmppl.results import time_axes, to_dataset
+from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -61,7 +62,7 @@ def forecast(
     data: Any = None,
     proposal: str | None = None,
     draws: int | None = None,
-    experiment: int | None = None,
+    experiment: Any = None,
     seed: int | None = None,
 ) -> xr.Dataset:
     """Draws of the states and observations after the last row of the data.
@@ -82,7 +83,8 @@ def forecast(
     proposal, draws : at known parameters, how x_T is drawn, as of `smooth`, where "laplace",
         "extended" and "unscented" are approximations, then told by the attribute `approximate`
         (None: exactly where that can be, else by particles); and how often (None: 1000).
-    experiment : which one is continued, from 1, where several were sampled.
+    experiment : which one is continued, where several were sampled: its label, or its number from 1
+        where it has none.
     seed : the same seed gives the same draws.
 
     Returns
@@ -145,10 +147,10 @@ def forecast(
             **model_attributes(traced),
             "seed": str(root.entropy),
             "after": int(rows),
-            "experiment": experiment or 1,
+            "experiment": 1 if experiment is None else experiment,
             "observes": observes(traced),
         }
-        | ({TIME_ZONES: {"time": zone}} if zone else {})
+        | ({TIME_ZONES: {"1": zone}} if zone else {})
         | past.attrs,
     )
 
@@ -170,12 +172,14 @@ class _Past:
     attrs: dict[str, Any] = field(default_factory=dict)
 
 
-def _sampled(traced: Trace, idata: Any, experiment: int | None) -> _Past:
+def _sampled(traced: Trace, idata: Any, experiment: Any) -> _Past:
     """The draws of a posterior, and the data that it holds."""
     posterior = posterior_of(idata, KNOWN)
-    mark, axis = _which(traced, posterior, experiment)
+    known = posterior["experiment"].values.tolist() if "experiment" in posterior.dims else []
+    i = _one_of(known, experiment, "posterior is")
+    own = experiments_of(posterior)[i][1]
     theta = parameters_of(traced, posterior)
-    paths = states_of(traced, posterior, mark, axis)
+    paths = states_of(traced, own)
     if paths is None:
         raise ArgumentError(
             "the posterior holds no trajectories: a forecast starts from the last state",
@@ -183,19 +187,19 @@ def _sampled(traced: Trace, idata: Any, experiment: int | None) -> _Past:
         )
     theta, paths = all_draws(theta), all_draws(paths)
     rows = paths.shape[1]
-    given = _past(idata, "constant_data", traced.inputs, mark, rows)
+    given = _past(idata, "constant_data", traced.inputs, i)
     columns = [given[n].reshape(rows, -1) for n in traced.inputs]
     y = np.zeros((rows, len(traced.observation_symbols)))
     if feeds_back(traced):
-        seen = _past(idata, "observed_data", traced.observations, mark, rows)
+        seen = _past(idata, "observed_data", traced.observations, i)
         y[:] = pack(traced.observations.values(), seen)
     u = np.concatenate([np.zeros((rows, 0)), *columns], axis=1)
-    return _Past(theta, paths, u, y, posterior[axis].values, zone_of(posterior.attrs, axis))
+    return _Past(theta, paths, u, y, own["time"].values, zone_of(posterior.attrs, i))
 
 
 def _at_known(
     model: Model, parameters: Any, data: Any, proposal: str | None, draws: int | None,
-    experiment: int | None, seed: int | None,
+    experiment: Any, seed: int | None,
 ) -> _Past:  # fmt: skip
     """Draws of the states of one data set at known parameters, by `smooth`."""
     if isinstance(parameters, Estimate):
@@ -207,13 +211,14 @@ def _at_known(
             "ssm.maximize returned",
         )
     problem = pose(model, data)
-    several = len(problem.experiments)
-    which = _one_of(list(range(1, several + 1)) if several > 1 else [], experiment, "data are")
-    e, n = problem.experiments[which - 1], DRAWS if draws is None else draws
+    several = problem.experiments if len(problem.experiments) > 1 else ()
+    known = [k if e.label is None else e.label for k, e in enumerate(several, start=1)]
+    which = _one_of(known, experiment, "data are")
+    e, n = problem.experiments[which], DRAWS if draws is None else draws
     found = smooth(
         model, data, parameters, proposal=proposal, trajectories=n, quantiles=(), seed=seed
     )
-    one = found[which - 1] if isinstance(found, list) else found
+    one = as_list(found)[which]
     trace = problem.trace
     paths = pack_states(trace, {name: one[name].values for name in trace.initial})
     theta = np.tile(check_parameters(problem.trace, parameters), (n, 1))
@@ -369,46 +374,40 @@ def _gain(
     return out
 
 
-def _which(trace: Trace, posterior: Any, experiment: int | None) -> tuple[str, str]:
-    """What follows the variables' names, and the dim over time, of the experiment asked for.
+def _one_of(known: list[Any], experiment: Any, what: str) -> int:
+    """The place of the experiment asked for; known : labels, none where there is a single one.
 
     Raises
     ------
     ArgumentError : there are several, and none or an unknown one was asked for.
     """
-    known = [int(d.removeprefix("time_")) for d in time_axes(posterior.dims) if d != "time"]
-    which = _one_of(known, experiment, "posterior is")
-    return (f"_{which}", f"time_{which}") if known else ("", "time")
-
-
-def _one_of(known: list[int], experiment: int | None, what: str) -> int:
-    """The number of the experiment asked for; known : empty where there is a single one."""
     if not known and experiment in (None, 1):
-        return 1
+        return 0
     if experiment in known:
-        return int(experiment)
+        return known.index(experiment)
     raise ArgumentError(
         f"experiment={experiment!r}, and the {what} of "
-        + (f"the experiments {', '.join(map(str, known))}" if known else "a single experiment"),
-        fix=f"give experiment={known[0]}, or another of them" if known else "leave experiment out",
+        + (f"the experiments {listing('', map(str, known))}" if known else "a single experiment"),
+        fix=f"give experiment={known[0]!r}, or another of them"
+        if known
+        else "leave experiment out",
     )
 
 
-def _past(
-    idata: Any, name: str, names: Iterable[str], mark: str, rows: int
-) -> dict[str, np.ndarray]:
-    """Values (T, ...) by name, of a group of the data that were sampled.
+def _past(idata: Any, name: str, names: Iterable[str], i: int) -> dict[str, np.ndarray]:
+    """Values (T, ...) by name, of a group of the data that were sampled, of experiment i.
 
     Raises
     ------
     ArgumentError : they are not there.
     """
     found, out = group(idata, name), {}
+    own = None if found is None else experiments_of(found)[i][1]
     for n in names:
-        if found is None or f"{n}{mark}" not in found:
+        if own is None or n not in own:
             raise ArgumentError(
                 f"the group {name!r} has no {n!r}, which the last step of the data needs",
                 fix="give what ssm.sample returned, with all its groups",
             )
-        out[n] = np.asarray(found[f"{n}{mark}"].values, dtype=np.float64)
+        out[n] = np.asarray(own[n].values, dtype=np.float64)
     return out

@@ -22,6 +22,7 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
+from ssmppl.data.experiments import experiments_of
 from ssmppl.data.parameters import pack, pack_states
 from ssmppl.errors import ArgumentError, ModelError, listing
 from ssmppl.inference.run.labels import Labels, check_names, model_attributes, observes
@@ -31,7 +32,7 @@ from ssmppl.inference.verbs.simulate import check_drawable, check_finite, check_
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.tracing import trace
-from ssmppl.results import time_axes, to_inference_data
+from ssmppl.results import to_inference_data
 
 # Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.
 Drawn = tuple[np.ndarray, np.ndarray]
@@ -95,15 +96,13 @@ def all_draws(values: np.ndarray) -> np.ndarray:
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
 
-def states_of(trace: Trace, posterior: Any, mark: str, axis: str) -> np.ndarray | None:
-    """(chain, draw, T, D) trajectories of one experiment; None where they were not kept.
-
-    mark : what follows the names of its variables. axis : its dim over time.
-    """
+def states_of(trace: Trace, posterior: Any) -> np.ndarray | None:
+    """(chain, draw, T, D) trajectories of a single experiment (`experiments_of`); None where they
+    were not kept."""
     values: Mapping[str, Any] = {
-        name: _drawn(posterior, f"{name}{mark}", site.shape, (axis,))
+        name: _drawn(posterior, name, site.shape, ("time",))
         for name, site in trace.initial.items()
-        if f"{name}{mark}" in posterior and axis in posterior[f"{name}{mark}"].dims
+        if name in posterior and "time" in posterior[name].dims
     }
     if len(values) < len(trace.initial):
         return None
@@ -188,14 +187,15 @@ def predict(
         return _from_prior(traced, program, experiments, labels, draws, root, attrs)
     theta = parameters_of(traced, posterior)
     lead = theta.shape[:2]
-    predicted: dict[str, np.ndarray] = {}
+    predicted: list[dict[str, np.ndarray]] = []
+    sampled = experiments_of(posterior)
     for i, e in enumerate(experiments):
         paths = None
         if conditional is not False:
-            paths = states_of(traced, posterior, labels.mark(i), labels.axis(i))
-            _check_paths(paths, e, conditional)
+            paths = states_of(traced, sampled[min(i, len(sampled) - 1)][1])
             if paths is not None and i == 0:
-                _check_count(posterior, len(experiments))
+                _check_count(len(sampled), len(experiments))
+            _check_paths(paths, e, conditional)
         flat = all_draws(theta)
         if paths is not None:
             check_samplers(traced)
@@ -205,9 +205,10 @@ def predict(
             drawn = _simulated(program, e, flat, root, i)
         check_finite(traced, *drawn)
         y = drawn[1].reshape(*lead, *drawn[1].shape[1:])
-        predicted |= labels.named(i, unpack_observations(traced, y), leading=3)
+        predicted.append(unpack_observations(traced, y))
         attrs["conditional"] = paths is not None
-    return _container(experiments, labels, attrs, posterior_predictive=predicted)
+    together = labels.together(predicted, leading=3)
+    return _container(experiments, labels, attrs, posterior_predictive=together)
 
 
 def _check_paths(paths: np.ndarray | None, e: Experiment, conditional: bool | None) -> None:
@@ -225,9 +226,8 @@ def _check_paths(paths: np.ndarray | None, e: Experiment, conditional: bool | No
         )
 
 
-def _check_count(posterior: Any, given: int) -> None:
+def _check_count(sampled: int, given: int) -> None:
     """Trajectories belong to data sets by their place in the list, so that all have to be there."""
-    sampled = len(time_axes(posterior.dims))
     if sampled != given:
         raise ArgumentError(
             f"the posterior holds trajectories of {sampled} data sets, the data are {given}",
@@ -246,18 +246,18 @@ def _from_prior(
         traced, np.random.default_rng(root), draws, alternative="or posterior draws by idata="
     )
     prior = {n: v[None] for n, v in unpack_parameters(traced, theta).items()}
-    over_time: list[str] = []
-    predicted: dict[str, np.ndarray] = {}
+    paths: list[dict[str, np.ndarray]] = []
+    predicted: list[dict[str, np.ndarray]] = []
     for i, e in enumerate(experiments):
         x, y = _simulated(program, e, theta, root, i)
         check_finite(traced, x, y)
-        paths = labels.named(i, unpack_states(traced, x[None]), leading=3)
-        prior |= paths
-        over_time += [] if labels.several else list(paths)
-        predicted |= labels.named(i, unpack_observations(traced, y[None]), leading=3)
+        paths.append(unpack_states(traced, x[None]))
+        predicted.append(unpack_observations(traced, y[None]))
+    states = labels.together(paths, leading=3)
     return _container(
-        experiments, labels, attrs, prior=prior, prior_predictive=predicted, over_time=over_time
-    )
+        experiments, labels, attrs, prior=prior | states, over_time=states,
+        prior_predictive=labels.together(predicted, leading=3),
+    )  # fmt: skip
 
 
 def _simulated(
@@ -303,13 +303,9 @@ def _each(
 def _container(
     experiments: list[Experiment], labels: Labels, attrs: dict[str, Any], **groups: Any
 ) -> Any:
-    observed: dict[str, np.ndarray] = {}
-    inputs: dict[str, np.ndarray] = {}
-    for i, e in enumerate(experiments):
-        if e.seen.any():
-            observed |= labels.named(i, e.observed)
-        inputs |= labels.named(i, e.inputs)
+    seen = any(e.seen.any() for e in experiments)
     return to_inference_data(
-        observed_data=observed, constant_data=inputs, time=labels.time, dims=labels.dims,
-        coords=labels.coords, renamed=labels.renamed, attrs=attrs, **groups,
+        observed_data=labels.together([e.observed for e in experiments]) if seen else None,
+        constant_data=labels.together([e.inputs for e in experiments]),
+        **labels.arguments, attrs=attrs, **groups,
     )  # fmt: skip

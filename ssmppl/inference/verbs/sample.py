@@ -194,7 +194,7 @@ def sample(
             fix="draw the states, by another method than SMC2 and without states=False, or leave a "
             "parameter out of fixed=",
         )
-    check_names(problem.trace, problem.experiments, states)
+    check_names(problem.trace, problem.experiments)
     if checkpoint is None:
         _check_room(problem, sampling_method.by_row(chosen), chains, draws, states)
     root, checkpoint_file = seed_sequence(seed), None
@@ -324,29 +324,21 @@ def _to_arviz(
         n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in fixed_values
     }
     labels = Labels(trace, problem.experiments)
-    over_time: list[str] = []
-    observed: dict[str, np.ndarray] = {}
-    inputs: dict[str, np.ndarray] = {}
-    log_likelihood: dict[str, np.ndarray] = {}
-    for i, e in enumerate(problem.experiments):
-        if states:
-            paths = labels.named(i, unpack_states(trace, drawn[f"path_{i}"]), leading=3)
-            posterior |= paths
-            over_time += list(paths) if not labels.several else []
-        observed |= labels.named(i, e.observed)
-        inputs |= labels.named(i, e.inputs)
-        if f"increment_{i}" in drawn:
-            log_likelihood |= labels.named(i, {"y": drawn[f"increment_{i}"]}, leading=3)
+    numbers, paths = range(len(problem.experiments)), dict[str, np.ndarray]()
+    if states:
+        each = [unpack_states(trace, drawn[f"path_{i}"]) for i in numbers]
+        paths = labels.together(each, leading=3)
+    log_likelihood = None
+    if "increment_0" in drawn:  # 0.0 of a row that is not there, as of one that was not measured
+        increments = [{"y": drawn[f"increment_{i}"]} for i in numbers]
+        log_likelihood = labels.together(increments, leading=3, missing=0.0)
     return to_inference_data(
-        posterior=posterior,
+        posterior=posterior | paths,
         sample_stats=stats,
-        observed_data=observed,
-        constant_data=inputs or None,
-        log_likelihood=log_likelihood or None,
-        over_time=over_time,
-        time=labels.time,
-        dims=labels.dims,
-        coords=labels.coords,
-        renamed=labels.renamed,
+        observed_data=labels.together([e.observed for e in problem.experiments]),
+        constant_data=labels.together([e.inputs for e in problem.experiments]) or None,
+        log_likelihood=log_likelihood,
+        over_time=paths,
+        **labels.arguments,
         attrs=attrs | labels.attrs,
     )

@@ -44,7 +44,13 @@ from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolv
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.invalid_laws import total_of
-from ssmppl.inference.run.labels import component_dims, model_attributes, observes, with_data
+from ssmppl.inference.run.labels import (
+    by_experiment,
+    component_dims,
+    model_attributes,
+    observes,
+    with_data,
+)
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.filters import LEVELS, normal_quantiles, quantile_levels
@@ -320,7 +326,7 @@ def smooth(
     proposal: str | None = None,
     quantiles: tuple[float, ...] = LEVELS,
     seed: int | None = None,
-) -> xr.Dataset | list[xr.Dataset]:
+) -> xr.Dataset | list[xr.Dataset] | dict[Any, xr.Dataset]:
     """The states given all of the data, p(x_{1:T} | y_{1:T}, parameters).
 
     Parameters
@@ -349,7 +355,7 @@ def smooth(
 
     Returns
     -------
-    Dataset, or a list of them for several experiments
+    Dataset; of several experiments a list of them, or a dictionary by their labels
         Draws: the states, dims (trajectory, time, ...), and over time `distinct`, how many values
         the draws have at each step, and for FFBSi `ess`, of the filter.
         Moments, dim `draw` of length 1: as of `kalman_filter`, ``x``, ``x_sd``, ``x_quantile`` and
@@ -389,7 +395,7 @@ def smooth(
     datasets = [
         _dataset(setup, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
     ]
-    return datasets if len(datasets) > 1 else datasets[0]
+    return by_experiment(problem.experiments, datasets)
 
 
 def _with_proposal(

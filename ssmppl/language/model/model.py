@@ -56,6 +56,8 @@ class Model:
         that name in the data goes before.
     time_unit : of the time step where the times are dates: "s", "min", "h" or "D". Numbers are
         taken as they are.
+    experiment : name of the column that tells several experiments of a long table apart, each with
+        an initial state of its own; results call them by its values.
     dims : names of the axes of vectors and matrices, by quantity (``{"effect": ["season"]}``),
         which results have in place of `effect_dim_0`.
     coords : the labels of the components along such a dim (``{"season": ["winter", ...]}``).
@@ -81,6 +83,7 @@ class Model:
     def __init__(
         self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int | None] = (),
         time_step: str | None = None, time_unit: str = "s",
+        experiment: str | None = None,
         coords: Mapping[str, Iterable[Any]] | None = None,
         dims: Mapping[str, str | Iterable[str]] | None = None,
     ):  # fmt: skip
@@ -123,6 +126,13 @@ class Model:
                 fix="name each input once",
                 where=self.location,
             )
+        if not (experiment is None or (isinstance(experiment, str) and experiment)):
+            raise ModelError(
+                f"experiment={experiment!r}",
+                fix='give the name of the column that tells experiments apart, experiment="id"',
+                where=self.location,
+            )
+        self.experiment = experiment
         self.component_names = ComponentNames.of(dims, coords, self.location)
         self.name = name
         self.inputs: dict[str, tuple[int, ...]] = {
@@ -309,7 +319,7 @@ class Model:
         variable that one reads from outside gets another value."""
         functions = [f for role in ROLES for f in self.functions[role]]
         outer = digest_of_code(functions)
-        own = (self.name, tuple(self.inputs.items()), self.component_names)
+        own = (self.name, tuple(self.inputs.items()), self.experiment, self.component_names)
         return (*own, *map(tuple, self.functions.values()), outer)
 
     def __repr__(self) -> str:

@@ -69,6 +69,7 @@ class Trace:
     auxiliary : names of the states that are draws of a step: read by later distributions of the
         same step only. At the first row, where no step has led to, they are 0.
     time_step : the input that is the time to the next row, and its unit where times are dates.
+    experiment : the column of long tables that tells experiments apart.
     component_names : of vectors and matrices, in results.
     """
 
@@ -84,6 +85,7 @@ class Trace:
     choices: dict[Expr, tuple[Expr, int]] = field(default_factory=dict)
     auxiliary: frozenset[str] = frozenset()
     time_step: tuple[str, str] | None = None
+    experiment: str | None = None
     component_names: ComponentNames = field(default_factory=ComponentNames)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -76,13 +76,15 @@ def test_vectors_matrices_inputs_gaps_and_experiments(method):
     one = ssm.sample(vector, EXPERIMENTS, method, **SHORT)
     posterior = one["posterior"]
     assert posterior["Q"].shape == (2, 12, 2, 2)
-    assert posterior["x_2"].shape == (2, 12, 9, 2)
+    rows = posterior["rows"].values
+    assert posterior["x"].shape == (2, 12, 2, max(rows), 2)
+    assert rows[1] == 9
     assert np.all(np.linalg.eigvalsh(posterior["Q"].values) > 0)
     assert np.all(np.isfinite(one["sample_stats"]["lp"]))
-    s, x = posterior["s_1"].values, posterior["x_1"].values
+    s, x = (posterior[n].values[:, :, 0, : rows[0]] for n in ("s", "x"))
     np.testing.assert_allclose(s[..., 1:], x[..., :-1, 0], atol=1e-8)
     again = ssm.sample(vector, EXPERIMENTS, method, **SHORT, states=False)
-    assert "x_1" not in again["posterior"]
+    assert "x" not in again["posterior"]
     if not isinstance(method, ssm.MetropolisHastings):  # which draws no states nobody asked for
         np.testing.assert_array_equal(again["posterior"]["r"], posterior["r"])
     fixed = {"Q": np.eye(2), "b": np.zeros(2), "r": 0.2}
@@ -90,7 +92,9 @@ def test_vectors_matrices_inputs_gaps_and_experiments(method):
     assert "Q" not in held["posterior"]
     if not getattr(method, "order", 0) and not getattr(method, "correlation", 0):
         return
-    assert one["log_likelihood"]["y_1"].shape == (2, 12, 15)
+    increments = one["log_likelihood"]["y"]
+    assert increments.shape == (2, 12, 2, 15)
+    assert not increments.values[:, :, 1, 9:].any()  # as of rows that were not measured
 
 
 nonlinear = ssm.Model("nonlinear")

@@ -28,7 +28,7 @@ def model(feedback=False):
     return out
 
 
-def made(*name, last=None, time=None, mark=""):
+def made(*name, last=None, time=None, second=False):
     """A posterior whose parameters differ between chains, and its data. x_T is N(2, 0.3^2)."""
     rng = np.random.default_rng(seed_of("forecast", *name))
     x = rng.normal(2.0, 0.3, (CHAINS, DRAWS, ROWS))
@@ -36,10 +36,16 @@ def made(*name, last=None, time=None, mark=""):
     y = rng.standard_normal(ROWS)
     if last is not None:
         y[-1] = last
-    axis = {"dims": {f"{n}{mark}": [f"time{mark}"] for n in "xyu"}} if mark else {}
+    u, axis = np.linspace(-1, 1, ROWS), {}
+    if second:  # of two experiments, the first of which has a row less
+        x, y, u = (np.stack([np.zeros_like(v), v], axis=-2) for v in (x, y, u))
+        axis = {
+            "dims": {n: ["experiment", "time"] for n in "xyu"}, "coords": {"experiment": [1, 2]},
+            "further": {"rows": (["experiment"], np.array([ROWS - 1, ROWS]), {})},
+        }  # fmt: skip
     return to_inference_data(
-        posterior={"a": a, f"x{mark}": x}, over_time={"x"}, attrs={"fixed": {"b": B}}, time=time,
-        observed_data={f"y{mark}": y}, constant_data={f"u{mark}": np.linspace(-1, 1, ROWS)}, **axis,
+        posterior={"a": a, "x": x}, over_time={"x"}, attrs={"fixed": {"b": B}}, time=time,
+        observed_data={"y": y}, constant_data={"u": u}, **axis,
     )  # fmt: skip
 
 
@@ -139,11 +145,13 @@ def test_the_same_seed_gives_the_same_draws():
 
 
 def test_one_of_several_experiments():
-    idata = made(mark="_2")
+    idata = made(second=True)
     found = ssm.forecast(model(), idata, inputs={"u": FUTURE}, experiment=2, seed=1)
     plain = ssm.forecast(model(), made(), inputs={"u": FUTURE}, seed=1)
     np.testing.assert_array_equal(found["y"], plain["y"])
-    with pytest.raises(ArgumentError, match=r"experiment=None[\s\S]*experiment=2"):
+    first = ssm.forecast(model(), idata, inputs={"u": FUTURE}, experiment=1, seed=1)
+    assert first.attrs["after"] == ROWS - 1
+    with pytest.raises(ArgumentError, match=r"experiment=None[\s\S]*experiment=1"):
         ssm.forecast(model(), idata, inputs={"u": FUTURE})
     with pytest.raises(ArgumentError, match="leave experiment out"):
         ssm.forecast(model(), made(), inputs={"u": FUTURE}, experiment=3)
@@ -221,7 +229,7 @@ def test_the_zone_of_the_data_gets_to_the_forecast(several, tmp_path):
     idata = az.from_netcdf(save(idata, tmp_path / "p.nc"))
     found = ssm.forecast(level, idata, 4, experiment=2 if several else None, seed=1)
     np.testing.assert_array_equal(found["time"], dates[4:].tz_convert(None).to_numpy())
-    assert found.attrs["time_zones"] == '{"time": "Europe/Berlin"}'
+    assert found.attrs["time_zones"] == '{"1": "Europe/Berlin"}'
     if several:
         found = ssm.forecast(level, idata, 2, experiment=1, seed=1)
         assert found["time"].values.tolist() == [4, 5]

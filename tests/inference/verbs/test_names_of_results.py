@@ -6,7 +6,6 @@ import pytest
 import ssmppl as ssm
 from ssmppl.plots.density import prior_draws
 from ssmppl.plots.parameters import parameter_draws
-from ssmppl.results import time_axes
 from ssmppl.tables import wide_table
 
 rng = np.random.default_rng(0)
@@ -38,35 +37,24 @@ def observation({state}):
     return made
 
 
-# -- numbers of experiments
-@pytest.mark.parametrize(
-    ("parameter", "found"),
-    [("x_1", "state 'x'"), ("x_2", "the 2. of them"), ("y_1", "observation 'y'"),
-     ("u_2", "input 'u'"), ("time_1", "dimension 'time'")],
-)  # fmt: skip
-def test_a_parameter_called_like_a_trajectory_is_refused(parameter, found):
-    """Its draws would be written over by those of the state, or their dims be mistaken for its."""
-    with pytest.raises(ssm.ModelError, match=f"'{parameter}' is a parameter.*{found}") as error:
+# -- experiments
+@pytest.mark.parametrize("parameter", ["experiment", "rows", "times"])
+def test_a_parameter_called_like_a_dim_of_several_experiments_is_refused(parameter):
+    """Its draws would be written over by the labels."""
+    with pytest.raises(ssm.ModelError, match=f"'{parameter}' is a parameter.*several") as error:
         ssm.sample(model(parameter), DATA, ssm.MetropolisHastings(), **SHORT)
-    assert f"as {parameter[:-2]}_first" in str(error.value)
-    with pytest.raises(ssm.ModelError, match=f"'{parameter}' is a parameter.*{found}"):
+    assert f"as {parameter}_" in str(error.value)
+    with pytest.raises(ssm.ModelError, match=f"'{parameter}' is a parameter.*several"):
         ssm.predict(model(parameter), None, DATA, draws=5, seed=1)
+    idata = ssm.sample(model(parameter), DATA[0], ssm.MetropolisHastings(), **SHORT)
+    assert idata["posterior"][parameter].dims == ("chain", "draw")
 
 
-@pytest.mark.parametrize("parameter", ["x_3", "x_first", "x_11"])
-def test_other_numbers_are_no_ones(parameter):
+@pytest.mark.parametrize("parameter", ["x_1", "y_2", "time_1"])
+def test_numbers_are_no_ones(parameter):
     posterior = ssm.sample(model(parameter), DATA, ssm.MetropolisHastings(), **SHORT)["posterior"]
     assert posterior[parameter].dims == ("chain", "draw")
-    assert posterior["x_1"].dims == ("chain", "draw", "time_1")
-
-
-def test_of_one_data_set_all_names_are_free():
-    idata = ssm.sample(model("x_1"), DATA[0], ssm.MetropolisHastings(), **SHORT)
-    assert idata["posterior"]["x_1"].dims == ("chain", "draw")
-    free = ssm.predict(model("x_1"), idata, DATA, seed=1)  # x_1 is no trajectory
-    assert free["posterior_predictive"]["y_2"].dims == ("chain", "draw", "time_2")
-    without = ssm.sample(model("x_1"), DATA, ssm.MetropolisHastings(), **SHORT, states=False)
-    assert without["posterior"]["x_1"].dims == ("chain", "draw")
+    assert posterior["x"].dims == ("chain", "draw", "experiment", "time")
 
 
 # -- statistics
@@ -92,13 +80,6 @@ def test_a_state_called_like_a_statistic(method, name):
 
 
 # -- axes
-def test_which_dims_are_time():
-    dims = ["chain", "time_2", "draw", "time_10", "time_constants_dim_0", "time_1", "times",
-            "time_1_dim_0", "time_", "x_time"]  # fmt: skip
-    assert time_axes(dims) == ["time_1", "time_2", "time_10"]
-    assert time_axes(["draw", "time", "timeout_dim_0"]) == ["time"]
-
-
 @pytest.mark.parametrize("data", [DATA[0], DATA], ids=["one", "two"])
 @pytest.mark.parametrize("name", ["time_constants", "timeout"])
 def test_a_vector_of_times_is_a_parameter(name, data):

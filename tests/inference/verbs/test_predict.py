@@ -52,12 +52,11 @@ def test_prior_predictive_draws_have_the_models_law():
     assert group(found, "constant_data")["u"].values.tolist() == U.tolist()
 
 
-def posterior(mark="", states=True):
-    rng = np.random.default_rng(seed_of("posterior", mark))
-    own = {f"x{mark}": rng.normal(5.0, 3.0, (2, 4000, ROWS))} if states else {}
-    axis = {"dims": {n: [f"time{mark}"] for n in own}} if mark else {}
+def posterior(states=True):
+    rng = np.random.default_rng(seed_of("posterior", ""))
+    own = {"x": rng.normal(5.0, 3.0, (2, 4000, ROWS))} if states else {}
     m = np.repeat([[1.0], [-4.0]], 4000, axis=1)
-    return to_inference_data(posterior={"m": m, **own}, over_time={"x"}, **axis)
+    return to_inference_data(posterior={"m": m, **own}, over_time={"x"})
 
 
 def test_given_the_trajectories_or_simulated_anew():
@@ -87,16 +86,15 @@ def test_several_experiments(tmp_path):
     data = [{"y": np.zeros(ROWS), "u": U}, {"y": np.zeros(3), "u": U[:3]}]
     found = ssm.predict(model(), None, data, draws=10, seed=1)
     drawn = group(found, "prior_predictive")
-    assert drawn["y_1"].dims == ("chain", "draw", "time_1")
-    assert drawn["y_2"].shape == (1, 10, 3)
-    assert group(found, "observed_data")["y_2"].dims == ("time_2",)
+    assert drawn["y"].dims == ("chain", "draw", "experiment", "time")
+    assert drawn["y"].shape == (1, 10, 2, ROWS)
+    assert np.isnan(drawn["y"].values[:, :, 1, 3:]).all()
+    assert np.isfinite(drawn["y"].values[:, :, 1, :3]).all()
+    assert drawn["rows"].values.tolist() == [ROWS, 3]
+    assert group(found, "observed_data")["y"].dims == ("experiment", "time")
     save(found, tmp_path / "drawn.nc")
-    later = ssm.predict(model(), posterior("_2"), [data[1], data[0]], seed=1)
-    drawn = group(later, "posterior_predictive")
-    kept = group(posterior("_2"), "posterior")
-    noise = drawn["y_2"].values - kept["x_2"].values - kept["m"].values[:, :, None]
-    agree(noise.ravel(), 0.0, 0.25)
-    assert drawn["y_1"].shape == (2, 4000, 3)  # simulated: there are no trajectories of it
+    with pytest.raises(ssm.ArgumentError, match="trajectories of 1 data sets, the data are 2"):
+        ssm.predict(model(), posterior(), data, seed=1)
 
 
 def test_after_sampling():

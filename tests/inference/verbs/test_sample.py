@@ -104,9 +104,13 @@ def test_fixed_parameters_and_no_states(method):
 
 def test_several_experiments_have_their_own_time():
     idata = ssm.sample(walk, [DATA, simulated(25, 2)], ssm.PGAS(particles=10), seed=1, **SHORT)
-    assert idata["posterior"]["x_1"].shape == (2, 20, 40, 2)
-    assert idata["posterior"]["x_2"].shape == (2, 20, 25, 2)
-    assert idata["observed_data"]["k_2"].shape == (25,)
+    x = idata["posterior"]["x"]
+    assert x.shape == (2, 20, 2, 40, 2)
+    assert x.dims == ("chain", "draw", "experiment", "time", "x_dim_0")
+    assert np.isfinite(x.values[:, :, 1, :25]).all()
+    assert np.isnan(x.values[:, :, 1, 25:]).all()
+    assert x["rows"].values.tolist() == [40, 25]
+    assert idata["observed_data"]["k"].dims[:2] == ("experiment", "time")
 
 
 def test_a_model_without_parameters():
