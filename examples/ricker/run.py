@@ -9,7 +9,7 @@ from model import ricker
 import ssmppl as ssm
 
 data = pd.read_csv(Path(__file__).with_name("data.csv"), index_col="time")
-idata = ssm.sample(ricker, data, ssm.PGAS(), draws=500, warmup=200, thin=4, chains=2, seed=1)
+idata = ssm.sample(ricker, data, ssm.PGAS(), draws=2500, warmup=500, thin=4, seed=1)
 table = ssm.summary(idata)
 table.insert(0, "truth", pd.Series({"log_r": 3.8, "q": 0.09, "phi": 10.0}))
 print(table.round(3), "\n")

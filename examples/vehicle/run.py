@@ -14,7 +14,7 @@ TRUTH = {
 files = sorted(Path(__file__).parent.glob("*.csv"))
 data = [pd.read_csv(file, index_col="time") for file in files]
 idata = ssm.sample(
-    vehicle, data, ssm.MetropolisHastings(), draws=1200, warmup=600, chains=2, seed=1, states=False
+    vehicle, data, ssm.MetropolisHastings(), draws=8000, warmup=1000, seed=1, states=False
 )
 table = ssm.summary(idata)[["mean", "sd", "ess_bulk", "r_hat"]]
 table.insert(0, "truth", pd.Series(TRUTH))

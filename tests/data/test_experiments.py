@@ -105,7 +105,7 @@ def test_panels_are_titled_by_the_labels():
         ssm.plot_filter(ssm.kalman_filter(TREES, LONG, THETA)),
         ssm.plot_predictions(ssm.kalman_filter(TREES, LONG, THETA)),
     ):
-        titles = [ax.get_title(loc="left") for ax in np.atleast_2d(axes)[0]]
+        titles = [ax.get_title(loc="left").split("\n")[0] for ax in np.ravel(axes)]
         assert [t for t in titles if t in YEARS] == list(YEARS)
 
 
