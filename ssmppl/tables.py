@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "component_label",
+    "joined_tables",
     "quantiles_of",
     "state_table",
     "summary",
@@ -159,3 +160,13 @@ def _posterior(idata: Any) -> Any:
             fix="give what ssm.sample returned; a result of a filter or smoother is an xarray "
             "Dataset, whose states ssm.plot_states shows and .to_dataframe() lists",
         ) from None
+
+
+def joined_tables(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Tables of several experiments below one another, with a column of their labels; a single one,
+    labelled "", as it is."""
+    import pandas as pd
+
+    if list(tables) == [""]:
+        return tables[""]
+    return pd.concat(dict(tables), names=["experiment"]).reset_index("experiment")

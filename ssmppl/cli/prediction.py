@@ -47,7 +47,7 @@ from ssmppl.cli.rendering import (
 from ssmppl.data.experiments import experiments_of
 from ssmppl.errors import DataError
 from ssmppl.modelfile import load_model, parse_assignments
-from ssmppl.tables import wide_table
+from ssmppl.tables import joined_tables, wide_table
 
 __all__ = ["forecast", "leave_future_out", "predict"]
 
@@ -124,8 +124,9 @@ def predict(
 @option("--steps", type=int, section="Model and data",
         help="Number of rows [default: number of input rows].")  # fmt: skip
 @INPUTS
-@option("--experiment", type=int, section="Model and data",
-        help="Which one is continued, from 1, where several were sampled.")  # fmt: skip
+@option("--experiment", section="Model and data",
+        help="Which one is continued, where several were sampled: its label, or its number from 1 "
+        "[default: all].")  # fmt: skip
 @option("--proposal", metavar="NAME",
         help="With --parameters: laplace, extended or unscented, approximations, or the proposal "
         "of a particle filter [default: exact where the model allows it].")  # fmt: skip
@@ -135,7 +136,7 @@ def predict(
         "File for the draws: .nc, or .csv and .parquet for a row per draw and time.")  # fmt: skip
 def forecast(
     model: str, posterior: Path, parameters: tuple[str, ...], steps: int | None,
-    inputs: Path | None, experiment: int | None, proposal: str | None, draws: int | None,
+    inputs: Path | None, experiment: str | None, proposal: str | None, draws: int | None,
     seed: int | None, output: Path | None,
 ) -> None:  # fmt: skip
     """Draws of states and observations after the last row of the data.
@@ -166,16 +167,21 @@ def forecast(
         data=None if known is None else read_data((posterior,)), proposal=proposal, draws=draws,
         experiment=experiment, seed=seed,
     )  # fmt: skip
-    time = found["time"].values
-    over_time = {str(n): v for n, v in found.data_vars.items() if "time" in v.dims}
-    spreads = spread(over_time, ("draw",))
-    heading(f"{loaded.name}: {found.sizes['draw']} draws of the {len(time)} rows after row "
-            f"{found.attrs['after']}")  # fmt: skip
-    say(table_text(spread_table(spreads, time)))
-    write(found, path, wide_table(found).set_index("time"))
+    every, tables = [], {}
+    for label, one in experiments_of(found):
+        time, after = one["time"].values, int(one["after"] if label else found.attrs["after"])
+        over_time = {str(n): v for n, v in one.data_vars.items() if "time" in v.dims}
+        spreads = spread(over_time, ("draw",))
+        heading(f"{loaded.name}{f', experiment {label}' if label else ''}: {found.sizes['draw']} "
+                f"draws of the {len(time)} rows after row {after}")  # fmt: skip
+        say(table_text(spread_table(spreads, time)))
+        tables[label] = wide_table(one).set_index("time")
+        own = {"after": after, "time": time, "variables": spreads}
+        every.append({"experiment": label, **own} if label else own)
+    write(found, path, joined_tables(tables))
     wrote(path)
-    answer(model=loaded.name, draws=found.sizes["draw"], after=found.attrs["after"], time=time,
-           variables=spreads, seed=seed, files=[path])  # fmt: skip
+    rest = {"experiments": every} if len(every) > 1 else every[0]
+    answer(model=loaded.name, draws=found.sizes["draw"], **rest, seed=seed, files=[path])
 
 
 @command("leave-future-out", "How well each row is predicted from those before it.")

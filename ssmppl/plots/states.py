@@ -138,8 +138,15 @@ def plot_forecast(
     """
     wanted = "give what ssm.forecast returns, and as the second argument the posterior"
     if not is_dataset(result) or not {"draw", "time"} <= set(map(str, result.dims)) \
-            or "after" not in result.attrs:  # fmt: skip
+            or not ("after" in result.attrs or "after" in result.coords):  # fmt: skip
         raise wrong_kind("plot_forecast", result, wanted)
+    if "experiment" in result.dims:
+        label = result["experiment"].values.tolist()[0]
+        raise ArgumentError(
+            f"plot_forecast draws one experiment, and the forecast is of "
+            f"{result.sizes['experiment']}",
+            fix=f"give ssm.forecast(..., experiment={label!r})",
+        )
     ahead: dict[str, np.ndarray] = {}
     for name, variable in result.data_vars.items():
         if variable.dims[:2] == ("draw", "time"):

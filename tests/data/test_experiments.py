@@ -97,6 +97,42 @@ def test_results_have_a_dim_with_the_labels(tmp_path):
     )
 
 
+def test_all_are_forecast_together(tmp_path):
+    idata = ssm.sample(TREES, LONG, **SHORT)
+    every = ssm.forecast(TREES, idata, 3, seed=1)
+    assert every["y"].dims == ("draw", "experiment", "time")
+    assert every["after"].values.tolist() == [len(v) for v in YEARS.values()]
+    every.to_netcdf(tmp_path / "f.nc", engine="h5netcdf")
+    again = xr.load_dataset(tmp_path / "f.nc", engine="h5netcdf")
+    for (label, own), years in zip(experiments_of(again), YEARS.values(), strict=True):
+        assert own["time"].values.tolist() == [max(years) + k for k in (1, 2, 3)]
+        alone = ssm.forecast(TREES, idata, 3, experiment=label, seed=1)
+        np.testing.assert_array_equal(own["mu"].values, alone["mu"].values)
+        last = idata["posterior"]["x"].sel(experiment=label).values[..., len(years) - 1].ravel()
+        step = own["x"].values[:, 0] - 0.8 * last - own["mu"].values
+        assert np.abs(step).max() < 8.0 * np.sqrt(own["q"].values.max())
+    with pytest.raises(ssm.ArgumentError, match="draws one experiment"):
+        ssm.plot_forecast(every, idata)
+
+
+def test_inputs_of_the_rows_to_come_of_each():
+    model = ssm.Model("driven", inputs=("u",))
+    model.initial(lambda: {"x": ssm.Dirac(0.0)})
+    model.transition(lambda x, u: {"x": ssm.Dirac(x + u)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    data = {k: {"u": np.zeros(n), "y": np.zeros(n)} for k, n in (("a", 3), ("b", 2))}
+    steps = {"a": {"u": [1.0, 1.0]}, "b": {"u": [5.0, 5.0]}}
+    for inputs in (steps, [steps["a"], steps["b"]]):
+        found = ssm.forecast(model, {}, inputs=inputs, data=data, draws=2, seed=1)
+        assert found["x"].values[0].tolist() == [[0.0, 1.0], [0.0, 5.0]]
+    same = ssm.forecast(model, {}, inputs=steps["a"], data=data, draws=2, seed=1)
+    assert same["x"].values[0].tolist() == [[0.0, 1.0]] * 2
+    with pytest.raises(ssm.ArgumentError, match="none for the experiment 'b'"):
+        ssm.forecast(model, {}, inputs={"a": steps["a"]}, data=data)
+    with pytest.raises(ssm.ArgumentError, match="1 data sets, and the experiments are 2"):
+        ssm.forecast(model, {}, inputs=[steps["a"]], data=data)
+
+
 def test_panels_are_titled_by_the_labels():
     idata = ssm.sample(TREES, LONG, **SHORT)
     for axes in (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
-from ssmppl.data.experiments import experiments_of
+from ssmppl.data.experiments import EXPERIMENT, TIMES, experiments_of
 from ssmppl.data.parameters import pack, pack_states
 from ssmppl.data.time_steps import lengths
 from ssmppl.data.times import label_text, spacing
@@ -84,15 +84,17 @@ def forecast(
         "extended" and "unscented" are approximations, then told by the attribute `approximate`
         (None: exactly where that can be, else by particles); and how often (None: 1000).
     experiment : which one is continued, where several were sampled: its label, or its number from 1
-        where it has none.
+        where it has none. None: all, and `inputs` may be a dictionary by their labels.
     seed : the same seed gives the same draws.
 
     Returns
     -------
     Dataset
         States and observations (draw, time, ...) and parameters (draw, ...); all chains one after
-        the other. Its time goes on from the data's where that is evenly spaced; where the data's
-        dates had a time zone, days and months are those of that zone. All dates are in UTC.
+        the other; of several experiments (draw, experiment, time, ...), with the coordinate `after`
+        (experiment), the rows that were before, and `times` where their labels differ. Its time
+        goes on from the data's where that is evenly spaced; where the data's dates had a time zone,
+        days and months are those of that zone. All dates are in UTC.
 
     Raises
     ------
@@ -107,18 +109,32 @@ def forecast(
     traced = trace(model)
     check_samplers(traced)
 
-    def known() -> _Past:
-        if data is None:
-            return _sampled(traced, idata, experiment)
-        return _at_known(model, idata, data, proposal, draws, experiment, seed)
+    if data is None:
+        labels, one = _sampled(traced, idata)
+    else:
+        labels, one = _at_known(model, idata, data, proposal, draws, seed)
+    root = seed_sequence(seed)
+    if experiment is not None or not labels:
+        which = _one_of(labels, experiment, "posterior is" if data is None else "data are")
+        return _ahead(
+            traced, one(which), inputs, steps, root, 1 if experiment is None else experiment
+        )
+    found = []
+    for i, own in enumerate(_inputs_of_each(inputs, labels)):
+        stream = np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, i))
+        found.append(_ahead(traced, one(i), own, steps, stream, labels[i]))
+    return _side_by_side(found, labels, str(root.entropy))
 
-    past = None
+
+def _ahead(
+    traced: Trace, past: _Past, inputs: Any, steps: int | None, root: np.random.SeedSequence,
+    experiment: Any,
+) -> xr.Dataset:  # fmt: skip
+    """The rows after those of one experiment."""
     if inputs is None and steps and _needs_times_only(traced):
-        past = known()
         inputs = _times_after(past, steps)
     future, steps, source = bind_inputs(traced, inputs, steps)
     labels = source.time
-    past = past or known()
     theta, paths, zone = past.theta, past.paths, past.zone
     rows = paths.shape[1]
     d, k = paths.shape[2], len(traced.observation_symbols)
@@ -131,7 +147,7 @@ def forecast(
     check_defined(traced, source, u, after=rows)
     feedback = feeds_back(traced)
     y = np.concatenate([past.y if feedback else np.zeros((rows, k)), np.zeros((steps, k))])
-    program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
+    program = compile_trace(traced, Missing(none=True))
     states, observed = _continued(program, theta, paths, y, u, feedback, root)
     check_finite(traced, states, observed)
     if labels is None:
@@ -147,12 +163,63 @@ def forecast(
             **model_attributes(traced),
             "seed": str(root.entropy),
             "after": int(rows),
-            "experiment": 1 if experiment is None else experiment,
+            "experiment": experiment,
             "observes": observes(traced),
         }
         | ({TIME_ZONES: {"1": zone}} if zone else {})
         | past.attrs,
     )
+
+
+def _inputs_of_each(inputs: Any, labels: Sequence[Any]) -> list[Any]:
+    """The inputs of each experiment: by label, in their order, or the same for all.
+
+    Raises
+    ------
+    ArgumentError : some experiment has none.
+    """
+    if isinstance(inputs, (list, tuple)):
+        if len(inputs) != len(labels):
+            raise ArgumentError(
+                f"inputs are {len(inputs)} data sets, and the experiments are {len(labels)}",
+                fix="give one for each, in their order, or a dictionary by label",
+            )
+        return list(inputs)
+    if isinstance(inputs, Mapping) and set(inputs) & set(labels):
+        missing = [k for k in labels if k not in inputs]
+        if missing:
+            raise ArgumentError(
+                f"inputs has none for the experiment {missing[0]!r}",
+                fix=f"give those of each of {listing('', map(str, labels))}; or one data set, "
+                "for all",
+            )
+        return [inputs[k] for k in labels]
+    return [inputs] * len(labels)
+
+
+def _side_by_side(found: list[xr.Dataset], labels: Sequence[Any], seed: str) -> xr.Dataset:
+    """Forecasts of all experiments: states and observations (draw, experiment, time)."""
+    import xarray as xr
+
+    times = [one["time"].values for one in found]
+    alike = all(np.array_equal(t, times[0]) for t in times)
+    own = [str(n) for n, v in found[0].data_vars.items() if "time" in v.dims]
+    rows = np.arange(1, len(times[0]) + 1)
+    parts = [one[own] if alike else one[own].assign_coords(time=rows) for one in found]
+    for one in parts:
+        one.attrs = {}
+    out = xr.concat(parts, dim=EXPERIMENT).transpose("draw", EXPERIMENT, "time", ...)
+    out = out.assign_coords({EXPERIMENT: list(labels)}).assign(found[0].drop_vars([*own, "time"]))
+    if not alike:
+        kinds = {t.dtype.kind for t in times}
+        texts = times if len(kinds) == 1 else [t.astype(str) for t in times]
+        out = out.assign_coords({TIMES: ((EXPERIMENT, "time"), np.stack(texts))})
+    before = [int(one.attrs["after"]) for one in found]
+    out = out.assign_coords({"after": (EXPERIMENT, before)})
+    shared = {
+        k: v for k, v in found[0].attrs.items() if k not in ("after", "experiment", TIME_ZONES)
+    }
+    return out.assign_attrs(shared | {"seed": seed})
 
 
 @dataclass(frozen=True)
@@ -172,36 +239,43 @@ class _Past:
     attrs: dict[str, Any] = field(default_factory=dict)
 
 
-def _sampled(traced: Trace, idata: Any, experiment: Any) -> _Past:
+Continued = tuple[list[Any], Callable[[int], _Past]]  # labels of several, and each of them
+
+
+def _sampled(traced: Trace, idata: Any) -> Continued:
     """The draws of a posterior, and the data that it holds."""
     posterior = posterior_of(idata, KNOWN)
-    known = posterior["experiment"].values.tolist() if "experiment" in posterior.dims else []
-    i = _one_of(known, experiment, "posterior is")
-    own = experiments_of(posterior)[i][1]
-    theta = parameters_of(traced, posterior)
-    paths = states_of(traced, own)
-    if paths is None:
-        raise ArgumentError(
-            "the posterior holds no trajectories: a forecast starts from the last state",
-            fix="sample with states=True",
-        )
-    theta, paths = all_draws(theta), all_draws(paths)
-    rows = paths.shape[1]
-    given = _past(idata, "constant_data", traced.inputs, i)
-    columns = [given[n].reshape(rows, -1) for n in traced.inputs]
-    y = np.zeros((rows, len(traced.observation_symbols)))
-    if feeds_back(traced):
-        seen = _past(idata, "observed_data", traced.observations, i)
-        y[:] = pack(traced.observations.values(), seen)
-    u = np.concatenate([np.zeros((rows, 0)), *columns], axis=1)
-    return _Past(theta, paths, u, y, own["time"].values, zone_of(posterior.attrs, i))
+    labels = posterior[EXPERIMENT].values.tolist() if EXPERIMENT in posterior.dims else []
+    every, theta = experiments_of(posterior), parameters_of(traced, posterior)
+
+    def one(i: int) -> _Past:
+        own = every[i][1]
+        paths = states_of(traced, own)
+        if paths is None:
+            raise ArgumentError(
+                "the posterior holds no trajectories: a forecast starts from the last state",
+                fix="sample with states=True",
+            )
+        paths = all_draws(paths)
+        rows = paths.shape[1]
+        given = _past(idata, "constant_data", traced.inputs, i)
+        columns = [given[n].reshape(rows, -1) for n in traced.inputs]
+        y = np.zeros((rows, len(traced.observation_symbols)))
+        if feeds_back(traced):
+            seen = _past(idata, "observed_data", traced.observations, i)
+            y[:] = pack(traced.observations.values(), seen)
+        u = np.concatenate([np.zeros((rows, 0)), *columns], axis=1)
+        zone = zone_of(posterior.attrs, i)
+        return _Past(all_draws(theta), paths, u, y, own["time"].values, zone)
+
+    return labels, one
 
 
 def _at_known(
     model: Model, parameters: Any, data: Any, proposal: str | None, draws: int | None,
-    experiment: Any, seed: int | None,
-) -> _Past:  # fmt: skip
-    """Draws of the states of one data set at known parameters, by `smooth`."""
+    seed: int | None,
+) -> Continued:  # fmt: skip
+    """Draws of the states at known parameters, by `smooth`."""
     if isinstance(parameters, Estimate):
         parameters = parameters.parameters
     if not isinstance(parameters, Mapping):
@@ -212,19 +286,24 @@ def _at_known(
         )
     problem = pose(model, data)
     several = problem.experiments if len(problem.experiments) > 1 else ()
-    known = [k if e.label is None else e.label for k, e in enumerate(several, start=1)]
-    which = _one_of(known, experiment, "data are")
-    e, n = problem.experiments[which], DRAWS if draws is None else draws
-    found = smooth(
-        model, data, parameters, proposal=proposal, trajectories=n, quantiles=(), seed=seed
+    labels = [k if e.label is None else e.label for k, e in enumerate(several, start=1)]
+    n = DRAWS if draws is None else draws
+    found = as_list(
+        smooth(model, data, parameters, proposal=proposal, trajectories=n, quantiles=(), seed=seed)
     )
-    one = as_list(found)[which]
-    trace = problem.trace
-    paths = pack_states(trace, {name: one[name].values for name in trace.initial})
-    theta = np.tile(check_parameters(problem.trace, parameters), (n, 1))
-    time = np.arange(1, e.steps + 1) if e.time is None else e.time
-    told = {k: one.attrs[k] for k in ("approximate", "method", "method_chosen") if k in one.attrs}
-    return _Past(theta, paths, e.u, np.where(e.seen > 0.0, e.y, np.nan), time, e.zone, told)
+
+    def one(i: int) -> _Past:
+        e, own, trace = problem.experiments[i], found[i], problem.trace
+        paths = pack_states(trace, {name: own[name].values for name in trace.initial})
+        theta = np.tile(check_parameters(trace, parameters), (n, 1))
+        time = np.arange(1, e.steps + 1) if e.time is None else e.time
+        told = {
+            k: own.attrs[k] for k in ("approximate", "method", "method_chosen") if k in own.attrs
+        }
+        y = np.where(e.seen > 0.0, e.y, np.nan)
+        return _Past(theta, paths, e.u, y, time, e.zone, told)
+
+    return labels, one
 
 
 def _needs_times_only(traced: Trace) -> bool:
@@ -383,11 +462,12 @@ def _one_of(known: list[Any], experiment: Any, what: str) -> int:
     """
     if not known and experiment in (None, 1):
         return 0
-    if experiment in known:
-        return known.index(experiment)
+    texts = [str(k) for k in known]
+    if str(experiment) in texts:  # a number may be given as a text, as on the command line
+        return texts.index(str(experiment))
     raise ArgumentError(
         f"experiment={experiment!r}, and the {what} of "
-        + (f"the experiments {listing('', map(str, known))}" if known else "a single experiment"),
+        + (f"the experiments {listing('', texts)}" if known else "a single experiment"),
         fix=f"give experiment={known[0]!r}, or another of them"
         if known
         else "leave experiment out",

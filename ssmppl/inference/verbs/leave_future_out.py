@@ -14,7 +14,7 @@ so far.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +28,7 @@ from ssmppl.arguments import checked
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, OK
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment
+from ssmppl.data.experiments import EXPERIMENT
 from ssmppl.data.notices import noticed
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.methods.methods import Method
@@ -35,7 +36,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.run.executors import check_executor
-from ssmppl.inference.run.labels import model_attributes
+from ssmppl.inference.run.labels import Labels, model_attributes
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
@@ -78,8 +79,11 @@ def leave_future_out(
     Parameters
     ----------
     model : the model, as declared.
-    data : one data set, as of `sample`.
-    first : the first row that is predicted, from 2; None: a quarter of the rows after the first.
+    data : as of `sample`. Several experiments go on together, by the labels of their rows where all
+        have dates, or all numbers, else row by row: a row is predicted from all rows of all of them
+        with an earlier label.
+    first : the first row that is predicted, from 2, of several experiments among all their labels;
+        None: a quarter of them after the first.
     method, draws, warmup, chains : of `sample`, each time that it is called.
     threshold : Pareto shape beyond which the model is sampled anew.
     particles : of the filters that give the predictive densities of each draw, where there is no
@@ -91,12 +95,13 @@ def leave_future_out(
 
     Returns
     -------
-    Dataset over `time` (the predicted rows)
-        `elpd`: log p(y_t | y_{1:t-1}), NaN where nothing was measured; `mc_error`: its Monte Carlo
-        standard error, by the spread of the weighted draws and the effective number of those of
-        the parameter that mixes worst; `pareto_shape`; `sampled_anew`: whether
-        the draws for this row are new ones. Attributes: `elpd`, the sum; `standard_error`, of the
-        sum, from its spread over the rows; `refits`, how often `sample` was called.
+    Dataset over `time` (the predicted rows), of several experiments over `experiment` and `time`
+        `elpd`: log p(y_t | y_{1:t-1}), of each experiment's row by itself, NaN where nothing was
+        measured; `mc_error`: its Monte Carlo standard error, by the spread of the weighted draws
+        and the effective number of those of the parameter that mixes worst; `pareto_shape`;
+        `sampled_anew`: whether the draws for this row are new ones. Attributes: `elpd`, the sum;
+        `standard_error`, of the sum, from its spread over the rows; `refits`, how often `sample`
+        was called.
 
     Raises
     ------
@@ -106,11 +111,6 @@ def leave_future_out(
     check_executor(executor)
     check_number("threshold", threshold, lambda v: True, "give a number, as 0.7", infinite=True)
     problem = pose(model, data, noting=True)
-    if len(problem.experiments) > 1:
-        raise ArgumentError(
-            f"{len(problem.experiments)} data sets: rows are left out of one series at a time",
-            fix="give one data set",
-        )
     check_count("particles", particles, 1)
     if set(problem.trace.parameters) <= set(fixed or {}):
         raise ArgumentError(
@@ -118,12 +118,13 @@ def leave_future_out(
             fix="take the log-likelihood increments of ssm.particle_filter, or of "
             "ssm.kalman_filter or ssm.forward_filter where they are exact",
         )
-    (whole,) = problem.experiments
-    begin = max(2, whole.steps // 4 + 1) if first is None else first
+    experiments, together = problem.experiments, _together(problem.experiments)
+    steps = len(together.labels)
+    begin = max(2, steps // 4 + 1) if first is None else first
     check_count("first", begin, 2)
-    if begin > whole.steps:
+    if begin > steps:
         raise ArgumentError(
-            f"first={begin}, and the data have {whole.steps} rows",
+            f"first={begin}, and the data have {steps} rows",
             fix="give a row of the data that leaves enough before it to learn from",
         )
     root = seed_sequence(seed)
@@ -132,17 +133,24 @@ def leave_future_out(
         "draws": draws, "warmup": warmup, "chains": chains, "method": method, "start": start,
         "fixed": fixed, "executor": executor, "progress": progress, "states": False,
     }  # fmt: skip
-    rows: list[_Row] = []
-    refits, increments, efficiency = 0, np.empty((0, whole.steps)), 1.0
+    elpd, error = (np.full((len(experiments), steps), np.nan) for _ in range(2))
+    shapes, anew = np.empty(steps), np.zeros(steps, dtype=bool)
+    refits, increments, efficiency = 0, list[np.ndarray](), 1.0
     since = begin - 1  # the rows that the draws know
-    for t in range(begin - 1, whole.steps):
+    for t in range(begin - 1, steps):
         fresh = refits == 0
         if not fresh:
-            log_w, shape = _smoothed(increments[:, since:t].sum(axis=1))
+            passed = [
+                own[:, before[since] : before[t]].sum(axis=1)
+                for own, before in zip(increments, together.before, strict=True)
+            ]
+            log_w, shape = _smoothed(np.sum(passed, axis=0))
             fresh = not shape <= threshold  # NaN is none to trust
         if fresh:
             with noticed():  # of the rows before t a channel may have none
-                idata = sample(model, _until(whole, t), seed=_number(seeds, refits), **settings)
+                known = [_until(e, b[t]) for e, b in zip(experiments, together.before, strict=True)]
+                known = [rows for rows in known if rows is not None]
+                idata = sample(model, known, seed=_number(seeds, refits), **settings)
             posterior = posterior_of(idata)
             if posterior.attrs["interrupted"]:  # a part of its draws, where nobody asked for it
                 raise KeyboardInterrupt
@@ -150,53 +158,73 @@ def leave_future_out(
             stream = np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 2, refits))
             increments = _increments(problem, theta, particles, stream, executor)
             since, refits, shape = t, refits + 1, -np.inf
-            log_w = np.full(len(increments), -np.log(len(increments)))
-        rows.append(_row(whole, t, log_w, increments[:, t], float(shape), fresh, efficiency))
-    elpd = np.array([r.elpd for r in rows])
+            log_w = np.zeros(theta.shape[0] * theta.shape[1])
+        shapes[t], anew[t] = float(shape), fresh
+        for i, (e, before) in enumerate(zip(experiments, together.before, strict=True)):
+            row = before[t]
+            if before[t + 1] > row and e.seen[row].any():
+                elpd[i, t], error[i, t] = _density(log_w, increments[i][:, row], efficiency)
+    elpd, error, shapes, anew = (v[..., begin - 1 :] for v in (elpd, error, shapes, anew))
     measured = np.isfinite(elpd) | np.isneginf(elpd)
     n = int(measured.sum())
     with np.errstate(invalid="ignore"):  # NaN where a row was impossible to every draw
         spread = float(np.sqrt(n * np.var(elpd[measured], ddof=1))) if n > 1 else float("nan")
-    labels = np.arange(1, whole.steps + 1) if whole.time is None else whole.time
+    labels = Labels(problem.trace, experiments)
+    several = {n: [EXPERIMENT, "time"] for n in ("elpd", "mc_error")} if labels.several else {}
     return to_dataset(
         {
-            "elpd": elpd[None],
-            "mc_error": np.array([[r.mc_error for r in rows]]),
-            "pareto_shape": np.array([[r.pareto_shape for r in rows]]),
-            "sampled_anew": np.array([[r.sampled_anew for r in rows]]),
+            "elpd": elpd if labels.several else elpd[0],
+            "mc_error": error if labels.several else error[0],
+            "pareto_shape": shapes,
+            "sampled_anew": anew,
         },
-        time=labels[begin - 1 :],
+        sample_dim=None,
+        dims=several,
+        coords=labels.coords,
+        time=together.labels[begin - 1 :],
         attrs={
             **model_attributes(problem.trace), "elpd": float(elpd[measured].sum()),
             "standard_error": spread, "refits": refits, "threshold": threshold,
             "seed": str(root.entropy),
         },
-    ).isel(draw=0, drop=True)  # fmt: skip
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class _Row:
-    elpd: float
-    mc_error: float
-    pareto_shape: float
-    sampled_anew: bool
+class _Together:
+    """Experiments side by side. labels : (L,) of all their rows, in order. before : of each, how
+    many of its rows have an earlier label, (L + 1,)."""
+
+    labels: np.ndarray
+    before: list[np.ndarray]
 
 
-def _row(
-    whole: Experiment, t: int, log_w: np.ndarray, increment: np.ndarray, shape: float, fresh: bool,
-    efficiency: float,
-) -> _Row:  # fmt: skip
-    """The weighted mean of p(y_t | y_{1:t-1}, theta)."""
-    if not whole.seen[t].any():
-        return _Row(np.nan, np.nan, shape, fresh)
+def _together(experiments: Sequence[Experiment]) -> _Together:
+    times = [e.time for e in experiments]
+    kinds = {"" if t is None else "M" if t.dtype.kind == "M" else t.dtype.kind for t in times}
+    kinds = {"number" if k and k in "iuf" else k for k in kinds}
+    if len(experiments) > 1 and (len(kinds) > 1 or not kinds <= {"number", "M", "m"}):
+        times = [None] * len(experiments)
+    own = [
+        np.arange(1, e.steps + 1) if t is None else t
+        for e, t in zip(experiments, times, strict=True)
+    ]
+    if len(experiments) == 1:
+        return _Together(own[0], [np.arange(len(own[0]) + 1)])
+    labels = np.unique(np.concatenate(own))
+    return _Together(labels, [np.append(np.searchsorted(t, labels), len(t)) for t in own])
+
+
+def _density(log_w: np.ndarray, increment: np.ndarray, efficiency: float) -> tuple[float, float]:
+    """Log of the weighted mean of p(y_t | y_{1:t-1}, theta), and its Monte Carlo error."""
     top = increment.max()
     if top == -np.inf:
-        return _Row(-np.inf, np.nan, shape, fresh)
+        return -np.inf, np.nan
     w, p = np.exp(log_w - log_w.max()), np.exp(increment - top)
     w /= w.sum()
     mean = float(w @ p)
     error = float(np.sqrt(np.sum(w**2 * (p - mean) ** 2) / efficiency)) / mean
-    return _Row(float(np.log(mean) + top), error, shape, fresh)
+    return float(np.log(mean) + top), error
 
 
 def _smoothed(log_w: np.ndarray) -> tuple[np.ndarray, float]:
@@ -225,8 +253,10 @@ def _efficiency(posterior: Any) -> float:
     return min(1.0, least / total) if np.isfinite(least) else 1.0
 
 
-def _until(whole: Experiment, rows: int) -> dict[str, np.ndarray]:
-    """The first rows as `sample` takes them."""
+def _until(whole: Experiment, rows: int) -> dict[str, np.ndarray] | None:
+    """The first rows as `sample` takes them; None where there are none yet."""
+    if not rows:
+        return None
     return {n: v[:rows] for n, v in (whole.observed | whole.inputs).items()}
 
 
@@ -238,8 +268,9 @@ def _number(seeds: np.random.SeedSequence, refit: int) -> int:
 def _increments(
     problem: Problem, theta: np.ndarray, particles: int, root: np.random.SeedSequence,
     executor: Executor | None,
-) -> np.ndarray:  # fmt: skip
-    """(S, T) log p(y_t | y_{1:t-1}, theta) of each draw, chains one after the other."""
+) -> list[np.ndarray]:  # fmt: skip
+    """(S, T) log p(y_t | y_{1:t-1}, theta) of each draw, chains one after the other, of each
+    experiment."""
     flat = all_draws(theta)
     settings = None
     if isinstance(exact_model(problem.trace), NotApplicable):
@@ -248,15 +279,26 @@ def _increments(
         settings = FilterSettings(particles, chosen)
     pieces = [p for p in np.array_split(np.arange(len(flat)), TASKS) if len(p)]
     task = partial(_some_increments, problem, flat, settings, root)
-    return np.concatenate(run_tasks(task, pieces, executor=executor))
+    found = run_tasks(task, pieces, executor=executor)
+    return [np.concatenate(own) for own in zip(*found, strict=True)]
 
 
 def _some_increments(
     problem: Problem, theta: np.ndarray, settings: FilterSettings | None,
     root: np.random.SeedSequence, which: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+) -> list[np.ndarray]:  # fmt: skip
     """Increments of some of the draws; a function that another process can be sent."""
-    (e,) = problem.experiments
+    return [
+        _of_experiment(problem, i, theta, settings, root, which)
+        for i in range(len(problem.experiments))
+    ]
+
+
+def _of_experiment(
+    problem: Problem, i: int, theta: np.ndarray, settings: FilterSettings | None,
+    root: np.random.SeedSequence, which: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    e = problem.experiments[i]
     out = np.full((len(which), e.steps), -np.inf)
     model = exact_model(problem.trace)
     for row, s in zip(out, which, strict=True):
@@ -270,7 +312,7 @@ def _some_increments(
         ess = np.empty(e.steps)
         status, t = problem.program.entry(f"filter_{settings.proposal}")(
             theta[s], e.y, e.seen, e.u, settings.particles, None, 1.0,
-            random_state(root, int(s)), row, ess, None,
+            random_state(root, int(s), *((i,) if i else ())), row, ess, None,
         )  # fmt: skip
         if status not in (OK, ALL_ZERO):
             raise failure(problem, theta[s], status, t, e)

@@ -151,8 +151,8 @@ def test_one_of_several_experiments():
     np.testing.assert_array_equal(found["y"], plain["y"])
     first = ssm.forecast(model(), idata, inputs={"u": FUTURE}, experiment=1, seed=1)
     assert first.attrs["after"] == ROWS - 1
-    with pytest.raises(ArgumentError, match=r"experiment=None[\s\S]*experiment=1"):
-        ssm.forecast(model(), idata, inputs={"u": FUTURE})
+    with pytest.raises(ArgumentError, match=r"experiment=3[\s\S]*experiment=1"):
+        ssm.forecast(model(), idata, inputs={"u": FUTURE}, experiment=3)
     with pytest.raises(ArgumentError, match="leave experiment out"):
         ssm.forecast(model(), made(), inputs={"u": FUTURE}, experiment=3)
 
@@ -305,8 +305,11 @@ def test_an_estimate_is_known_parameters():
     of_second = ssm.forecast(model(), estimate, inputs=inputs, data=data, experiment=2, seed=1)
     assert of_second.attrs["after"] == 2
     assert of_second["a"].values[0] == estimate.parameters["a"]
-    with pytest.raises(ArgumentError, match="experiment=None, and the data are of"):
-        ssm.forecast(model(), estimate, inputs=inputs, data=data)
+    with pytest.raises(ArgumentError, match="experiment=3, and the data are of"):
+        ssm.forecast(model(), estimate, inputs=inputs, data=data, experiment=3)
+    every = ssm.forecast(model(), estimate, inputs=inputs, data=data, seed=1)
+    assert every["y"].dims == ("draw", "experiment", "time")
+    assert every["after"].values.tolist() == [30, 2]
     with pytest.raises(ArgumentError, match="needs the data"):
         ssm.forecast(model(), estimate, inputs=inputs, proposal="laplace")
     with pytest.raises(ArgumentError, match="which is no parameters"):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.special import logsumexp
 
 import ssmppl as ssm
@@ -137,9 +138,54 @@ def test_what_is_out_of_range_is_refused(change, message, y):
         ssm.leave_future_out(plain(), {"y": y}, **change)
 
 
-def test_several_data_sets_are_refused(y):
-    with pytest.raises(ArgumentError, match="2 data sets"):
-        ssm.leave_future_out(plain(), [{"y": y}, {"y": y}])
+def panel(experiment=None):
+    """One unknown level, seen by everybody with noise of variance 1: all is known exactly."""
+    model = ssm.Model("level", experiment=experiment)
+    model.prior(lambda: {"mu": ssm.Normal(0, sd=2)})
+    model.initial(lambda: {"x": ssm.Dirac(0.0)})
+    model.transition(lambda x: {"x": ssm.Dirac(x)})
+    model.observation(lambda x, mu: {"y": ssm.Normal(x + mu, sd=1)})
+    return model
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_several_experiments_go_on_together(labelled):
+    """By their labels: what comes earlier in one tells of the others, and nothing later does."""
+    rng = np.random.default_rng(seed_of("panel"))
+    times = {"oak": [1, 2, 3, 5, 6], "elm": [4, 5, 7]}
+    y = {k: 1.5 + rng.normal(size=len(v)) for k, v in times.items()}
+    y["oak"][3] = np.nan
+    data = {k: {"y": v, **({"time": times[k]} if labelled else {})} for k, v in y.items()}
+    found = ssm.leave_future_out(panel(), data, first=3, seed=1, draws=2000, progress=False)
+    at = times if labelled else {k: list(range(1, len(v) + 1)) for k, v in times.items()}
+    labels = sorted({t for own in at.values() for t in own})[2:]
+    assert found["time"].values.tolist() == labels
+    assert found["elpd"].dims == ("experiment", "time")
+    total, limit = 0.0, MCSE
+    for k, own in at.items():
+        for t in labels:
+            got = found.sel(experiment=k, time=t)
+            if t not in own or np.isnan(y[k][own.index(t)]):
+                assert np.isnan(float(got["elpd"]))
+                continue
+            past = [v for n in at for s, v in zip(at[n], y[n], strict=True) if s < t and v == v]
+            precision = 1 / 4 + len(past)
+            expected = stats.norm.logpdf(
+                y[k][own.index(t)], sum(past) / precision, np.sqrt(1 + 1 / precision)
+            )
+            assert abs(float(got["elpd"]) - expected) < limit * float(got["mc_error"])
+            total += float(got["elpd"])
+    assert found.attrs["elpd"] == pytest.approx(total)
+
+
+def test_an_experiment_that_begins_later_is_not_sampled_before():
+    """The rows of a later record are predicted from those of the first, then from its own too."""
+    first = {"y": np.full(4, 3.0), "time": [1, 2, 3, 4]}
+    second = {"y": np.full(2, -3.0), "time": [5, 6]}
+    found = ssm.leave_future_out(panel(), [first, second], first=5, seed=1, progress=False)
+    assert np.isnan(found["elpd"].values[0]).all()
+    early, later = found["elpd"].values[1]
+    assert later > early  # one of its rows is known
 
 
 def test_parameters_that_are_all_fixed_leave_nothing_to_integrate_out():
