@@ -992,7 +992,7 @@ BAD_DATA = {
     "index of two levels": (
         "counts",
         table(counts_with(), index=pd.MultiIndex.from_product([["a"], range(5)])),
-        ["several levels", "groupby(level=0)"],
+        ["several levels", "experiment='id'", "data.index.names"],
     ),
     "Series of other rows": (
         "counts",

@@ -189,8 +189,14 @@ def _from_frame(data: Any, label: str, named: list[str]) -> Source:
     if getattr(data.index, "nlevels", 1) > 1:
         raise DataError(
             "the rows have an index of several levels",
-            fix="where a level tells experiments apart, name it in the model: "
-            f"ssm.Model(..., experiment={str(data.index.names[0])!r}); else data.reset_index()",
+            fix="where a level tells experiments apart, name it in the model, "
+            f"ssm.Model(..., experiment={str(data.index.names[0] or 'id')!r})"
+            + (
+                ""
+                if data.index.names[0]
+                else ", and in the data, data.index.names = ['id', 'time']"
+            )
+            + "; else data.reset_index()",
             where=source.place(),
         )
     column = "time" in names and "time" not in named

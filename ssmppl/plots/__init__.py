@@ -7,6 +7,7 @@
     filters.py      plot_filter, plot_ancestry
     predictions.py  plot_predictions
     parameters.py   plot_prior_posterior, plot_maximization
+    model.py        plot_model
     likelihood.py   plot_likelihood
 
 The panels of a report of `diagnose` are under these names too; they stand in
@@ -28,6 +29,7 @@ from ssmppl.diagnosis.report.panels import (
 )
 from ssmppl.plots.filters import plot_ancestry, plot_filter
 from ssmppl.plots.likelihood import plot_likelihood
+from ssmppl.plots.model import plot_model
 from ssmppl.plots.parameters import plot_maximization, plot_prior_posterior
 from ssmppl.plots.predictions import plot_predictions
 from ssmppl.plots.states import plot_forecast, plot_states
@@ -35,6 +37,7 @@ from ssmppl.plots.states import plot_forecast, plot_states
 __all__ = [
     "free_run", "gap_closed", "missing_term", "page", "panel_figures", "pictures", "plot",
     "plot_ancestry", "plot_filter", "plot_forecast", "plot_likelihood", "plot_maximization",
+    "plot_model",
     "plot_predictions", "plot_prior_posterior", "plot_states", "ranked_effects", "residual_map",
     "save", "separating_signal",
 ]  # fmt: skip

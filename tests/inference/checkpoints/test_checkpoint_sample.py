@@ -96,7 +96,7 @@ def test_a_call_without_states_goes_on_and_keeps_none(killed, tmp_path, monkeypa
 
     monkeypatch.setattr(CheckpointFile, "stack", stack)
     expected = {k: v for k, v in whole.items() if k[:11] != "posterior x"}
-    assert len(expected) == len(whole) - 2
+    assert len(expected) == len(whole) - 1
     for n in (9, 30):
         assert killed(n, name, path, states=False)
     assert bits(call(name, path, states=False)) == expected

@@ -134,11 +134,11 @@ def test_rows_sum_up_to_the_exact_likelihood_of_the_draw(case):
         np.testing.assert_array_equal(drawn, asked["posterior"][name])
     assert "log_likelihood" not in plain
     rows = asked["log_likelihood"]
-    assert rows["y_2"].shape == (2, 20, ROWS)
+    assert rows["y"].shape == (2, 20, 2, ROWS)
     for draw in (0, 19):
         theta = {n: float(asked["posterior"][n][1, draw]) for n in model_parameters(model)}
         for i, record in enumerate(records):
-            own = rows[f"y_{i + 1}"][1, draw]
+            own = rows["y"][1, draw, i]
             exact = ssm.log_likelihood(model, record, theta, proposal=proposal)
             np.testing.assert_allclose(float(own.sum()), float(np.ravel(exact)[0]), rtol=1e-6)
             assert abs(float(own[5])) < 1e-12  # nothing was measured
