@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import itertools
 import math
 import numbers
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,7 @@ INFINITY = math.inf
 LOG_2 = math.log(2.0)
 LOG_2PI = math.log(2.0 * math.pi)
 ROUNDING = 1e-9
+REPEATED = 4  # equal entries in a row from which they are said once
 WIDEST = 30  # characters of an argument that is written again in a fix
 
 
@@ -87,6 +89,34 @@ class DistributionAsNumber(ModelError):
 
 # (law, value) -> where a parameter of the law makes the density of the value highest
 Maximiser = Callable[[Any, ExprArray], Any]
+
+
+def array_text(values: ExprArray) -> str:
+    """An array in words: one number for equal ones, `diag([...])` for a diagonal matrix, and what
+    is repeated with how often."""
+    flat = list(values.ravel())
+    if not flat:
+        return "[]"
+    if all(e is flat[0] for e in flat):
+        return repr(flat[0])
+    if values.ndim < 2:
+        return _row_text(flat)
+    if values.ndim == 2:
+        rows = values.view(np.ndarray)
+        n = len(rows)
+        off = [rows[i, j] for i in range(n) for j in range(rows.shape[1]) if i != j]
+        if rows.shape == (n, n) and all(e.op == "const" and e.data == 0.0 for e in off):
+            return f"diag({_row_text([rows[i, i] for i in range(n)])})"
+    inner = [array_text(a) if a.ndim > 1 else _row_text(list(a)) for a in map(array, values)]
+    return f"[{', '.join(inner)}]"
+
+
+def _row_text(row: Sequence[Expr]) -> str:
+    parts: list[str] = []
+    for _, same in itertools.groupby(row, key=id):
+        run = [repr(e) for e in same]
+        parts += [f"{run[0]} ({len(run)} times)"] if len(run) >= REPEATED else run
+    return f"[{', '.join(parts)}]"
 
 
 class Distribution:
@@ -222,14 +252,7 @@ class Distribution:
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}") from None
 
     def __repr__(self) -> str:
-        def text(a: ExprArray) -> str:
-            flat = list(a.ravel())
-            if not flat:
-                return "[]"
-            same = all(e is flat[0] for e in flat)
-            return repr(flat[0]) if same else "[" + ", ".join(map(repr, flat)) + "]"
-
-        inside = ", ".join(f"{_plain_name(n)}={text(a)}" for n, a in self.parameters.items())
+        inside = ", ".join(f"{_plain_name(n)}={array_text(a)}" for n, a in self.parameters.items())
         return f"{type(self).__name__}({inside})"
 
     def inside(self) -> tuple[Distribution, ...]:
