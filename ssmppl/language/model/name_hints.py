@@ -4,7 +4,6 @@ brms, SciPy, TensorFlow Probability and pomp, and misspellings.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 _NORMAL = "ssm.Normal(mean, sd=)"
@@ -13,6 +12,7 @@ _NEGATIVE = "ssm.NegativeBinomial(mean, dispersion=)"
 _ZEROS = "ssm.ZeroInflated(ssm.{0}, p), p the probability of a structural zero"
 _HURDLE = "ssm.ZeroInflated(ssm.Truncated(ssm.{0}, lower=1), p), p the probability of zero"
 _MIXTURE = "ssm.Mixture(weights, [ssm.Normal(mean, sd=), ...])"
+_OWN = "a distribution of your own, by @ssm.distribution with its log density and sampler"
 _POINT = "ssm.Dirac(value) for a state, or a line of Python in the distribution that needs it"
 # lower case and without underscores -> what is written here
 HINTS: dict[str, str] = {
@@ -68,8 +68,35 @@ HINTS: dict[str, str] = {
     "fit": "ssm.sample(model, data) for a posterior, ssm.maximize(model, data) for an estimate",
     **dict.fromkeys(["mle", "optimize", "optimise"], "ssm.maximize(model, data)"),
     **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
-}
-CLOSE = 0.6  # least similarity of a misspelling
+    **dict.fromkeys(
+        ["skewnormal", "skewstudentt", "logistic", "inversegaussian", "wald", "kumaraswamy",
+         "asymmetriclaplace", "exgaussian", "exmodnormal", "genextreme", "generalizedpareto"],
+        _OWN,
+    ),
+    **dict.fromkeys(
+        ["pareto"],
+        "ssm.Exponential(rate=alpha) for the logarithm of x / x_min, and x_min * np.exp of it "
+        "where it acts; or " + _OWN,
+    ),
+    "gumbel": "loc - scale * np.log(e), with e from ssm.Exponential(rate=1), where it acts; or "
+    + _OWN,
+    "skellam": "the difference of two draws of the step: ssm.Poisson(a) and ssm.Poisson(b) under "
+    "names of their own, and ssm.Dirac of the difference",
+    **dict.fromkeys(
+        ["mvstudentt", "multivariatestudentt", "mvt", "multivariatet"],
+        "ssm.MvNormal(mean, covariance=V / w), with w from ssm.Gamma(df / 2, rate=df / 2), a draw "
+        "of the step",
+    ),
+    **dict.fromkeys(
+        ["lkj", "lkjcorr", "lkjcholesky", "lkjcholeskycov"],
+        "ssm.InverseWishart(df, scale=) for a covariance matrix: there is no prior of a "
+        "correlation matrix alone",
+    ),
+    **dict.fromkeys(["potential", "factor"], "a term of the log density as " + _OWN),
+    **dict.fromkeys(["censored", "interval"], _OWN + ", the probability of what is beyond the "
+                    "limit among its values"),
+}  # fmt: skip
+MISSPELT = 4  # letters to one of which is wrong, left out, too many, or swapped with the next
 
 
 def name_hint(name: str, known: Iterable[str]) -> str:
@@ -77,6 +104,22 @@ def name_hint(name: str, known: Iterable[str]) -> str:
     plain = name.lower().replace("_", "")
     if plain in HINTS:
         return f"write {HINTS[plain]}"
-    spelled = {k.lower(): k for k in known}
-    near = difflib.get_close_matches(name.lower(), spelled, n=1, cutoff=CLOSE)
-    return f"write ssm.{spelled[near[0]]}" if near else ""
+    spelled = {k.lower().replace("_", ""): k for k in known}
+    allowed = max(len(plain) // MISSPELT, 1) if len(plain) > 2 else 0
+    slips = {k: _slips(plain, k) for k in spelled if abs(len(k) - len(plain)) <= allowed}
+    near = min(slips, key=lambda k: slips[k], default="")
+    return f"write ssm.{spelled[near]}" if near and slips[near] <= allowed else ""
+
+
+def _slips(a: str, b: str) -> int:
+    """Letters that are wrong, left out, too many or swapped: the distance of optimal string
+    alignment (G. V. Bard, "Spelling-error tolerant, order-independent pass-phrases", 2007)."""
+    before, row = list[int](), list(range(len(b) + 1))
+    for i, x in enumerate(a, start=1):
+        before, last, row = row, before, [i]
+        for j, y in enumerate(b, start=1):
+            found = min(before[j] + 1, row[j - 1] + 1, before[j - 1] + (x != y))
+            if i > 1 and j > 1 and x == b[j - 2] and a[i - 2] == y:
+                found = min(found, last[j - 2] + 1)
+            row.append(found)
+    return row[-1]

@@ -18,6 +18,15 @@ NAMES = {
     "GammaPoisson": "write ssm.NegativeBinomial(mean, dispersion=)",
     "Multinomial": "ssm.Binomial(left, p[k] / np.sum(p[k:]))",
     "loglikelihood": "write ssm.log_likelihood",
+    "Normla": "write ssm.Normal",
+    "Poison": "write ssm.Poisson",
+    "smaple": "write ssm.sample",
+    "NegativeBionmial": "write ssm.NegativeBinomial",
+    "SkewNormal": "write a distribution of your own, by @ssm.distribution",
+    "Pareto": "write ssm.Exponential(rate=alpha) for the logarithm",
+    "Potential": "a term of the log density",
+    "LKJCholeskyCov": "ssm.InverseWishart",
+    "MvStudentT": "ssm.MvNormal(mean, covariance=V / w)",
     "prior": 'write model = ssm.Model("name"), and then @model.prior',
     "transition": 'write model = ssm.Model("name"), and then @model.transition',
 }
@@ -30,6 +39,13 @@ def test_a_name_that_is_not_there(name):
         getattr(ssm, name)
     assert f"module 'ssmppl' has no attribute {name!r}" in str(caught.value)
     assert NAMES[name] in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["save", "Bilinear", "predictive", "Tweedie", "x"])
+def test_another_word_is_no_misspelling(name):
+    """`save` was answered by PSAEM, and `Pareto` by predict."""
+    with pytest.raises(AttributeError, match=rf"no attribute '{name}'$"):
+        getattr(ssm, name)
 
 
 def test_nothing_near_is_left_out():
@@ -56,6 +72,14 @@ def test_what_is_written_exists():
         names = re.findall(r"ssm\.(\w+)", text)
         assert names, text
         assert set(names) <= set(ssm.__all__), text
+
+
+def test_what_acts_by_a_function_has_the_distribution_that_was_asked_for():
+    x = np.array([1.3, 2.0, 7.5])
+    tail = [float(evaluate(ssm.Exponential(rate=2.5).survival(np.log(v / 1.2)))) for v in x]
+    np.testing.assert_allclose(tail, st.pareto(2.5, scale=1.2).sf(x))
+    tail = [float(evaluate(ssm.Exponential(rate=1).survival(np.exp(-(v - 1.0) / 0.7)))) for v in x]
+    np.testing.assert_allclose(tail, st.gumbel_r(1.0, 0.7).cdf(x))
 
 
 def test_a_multinomial_of_binomials_and_its_overdispersed_kin():
