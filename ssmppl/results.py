@@ -12,6 +12,7 @@ import os
 import platform
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
+    "Rows",
     "arviz",
     "save",
     "to_dataset",
@@ -34,6 +36,20 @@ BY_ROW = ("log_likelihood", "prior_predictive", "posterior_predictive")
 
 # What a netCDF attribute may hold in the 64 KB that HDF5 leaves for one; longer text is cut.
 LONGEST_ATTRIBUTE = 60_000
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What the log-likelihoods of rows lie along: those that were measured.
+
+    dims : names. time : their labels along `time`. further : as of `to_inference_data`.
+    """
+
+    dims: tuple[str, ...]
+    time: Any = None
+    further: Mapping[str, tuple[Sequence[str], np.ndarray, Mapping[str, Any]]] = field(
+        default_factory=dict
+    )
 
 
 def to_inference_data(
@@ -53,6 +69,7 @@ def to_inference_data(
     coords: Mapping[str, Any] | None = None,
     renamed: Mapping[str, str] | None = None,
     further: Mapping[str, tuple[Sequence[str], np.ndarray, Mapping[str, Any]]] | None = None,
+    rows: Rows | None = None,
     attrs: Mapping[str, Any] | None = None,
 ) -> Any:
     """ArviZ InferenceData of a run; under ArviZ 1.x an `xarray.DataTree` with the same groups.
@@ -82,6 +99,8 @@ def to_inference_data(
         Other names of dims that follow from the names of variables: `x_dim_0`.
     further
         Coordinates that are no dims, with their dims and attributes: in each group that has these.
+    rows
+        Dims and labels of log_likelihood, where it does not have those of the other groups.
     attrs
         What the run was. Made fit for netCDF (see `netcdf_attributes`), and written on the whole
         and on every group of draws.
@@ -102,15 +121,16 @@ def to_inference_data(
         if not variables:
             continue
         by_row = group in fixed or group in BY_ROW
+        special = rows if group == "log_likelihood" else None
         groups[group] = _dataset(
             variables,
             sample_dims=() if group in fixed else ("chain", "draw"),
             over_time=variables if by_row else own.get(group, over_time),
-            time=time,
-            dims=dims or {},
+            time=time if special is None else special.time,
+            dims=(dims or {}) if special is None else dict.fromkeys(variables, special.dims),
             coords=coords or {},
             renamed=renamed or {},
-            further=further or {},
+            further=(further or {}) if special is None else special.further,
             attrs={} if group in fixed else written,
         )
     return _container(groups, written)

@@ -21,6 +21,7 @@ from ssmppl.data.experiments import EXPERIMENT, ROWS, TIMES, WHOLE
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.language.model.trace import Trace
+from ssmppl.results import Rows
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -156,13 +157,11 @@ class Labels:
         }  # fmt: skip
 
     def together(
-        self, each: Sequence[Mapping[str, Any]], leading: int = 1, missing: float = np.nan
+        self, each: Sequence[Mapping[str, Any]], leading: int = 1
     ) -> dict[str, np.ndarray]:
         """Variables of all experiments, by name, of each of which the last of `leading` axes is
-        time: with an axis before it for the experiment, where there are several.
-
-        missing : what stands after the end of a shorter experiment.
-        """
+        time: with an axis before it for the experiment, where there are several, and NaN after the
+        end of a shorter one."""
         if not self.several:
             return dict(each[0])
         out: dict[str, np.ndarray] = {}
@@ -177,10 +176,41 @@ class Labels:
                     whole = out[n][c] if before else out[n]
                     at = (slice(None),) * max(len(before) - 1, 0)
                     whole[(*at, i, slice(0, rows))] = own[n][c]  # type: ignore[index]
-                    whole[(*at, i, slice(rows, None))] = missing  # type: ignore[index]
-            # a channel's log-likelihood has none but the first two
-            self.dims[n] = max([EXPERIMENT, "time", *rest], self.dims.get(n, []), key=len)
+                    whole[(*at, i, slice(rows, None))] = np.nan  # type: ignore[index]
+            self.dims[n] = [EXPERIMENT, "time", *rest]
         return out
+
+
+def measured_rows(
+    labels: Labels, experiments: Sequence[Experiment], increments: Sequence[np.ndarray]
+) -> tuple[np.ndarray, Rows] | None:
+    """Log-likelihoods (chain, draw, T) of each experiment's rows, those that were measured, and
+    what they lie along; None where none was.
+
+    Others count for ArviZ as observations, of a log-likelihood that does not vary. Of several
+    experiments that differ in their rows all lie along `row`, with their experiment and time.
+    """
+    seen = [e.seen.any(axis=1) for e in experiments]
+    if not any(s.any() for s in seen):
+        return None
+    if not labels.several:
+        time = np.arange(1, labels.rows[0] + 1) if labels.time is None else labels.time
+        whole = bool(seen[0].all())
+        values = increments[0] if whole else increments[0][..., seen[0]]
+        return values, Rows(("time",), np.asarray(time)[seen[0]])
+    if all(s.all() for s in seen) and len(set(labels.rows)) == 1:
+        together = np.stack(increments, axis=-2)
+        return together, Rows((EXPERIMENT, "time"), labels.time, labels.further)
+    values = np.concatenate([v[..., s] for v, s in zip(increments, seen, strict=True)], axis=-1)
+    names = np.asarray(labels.coords[EXPERIMENT])
+    own = [np.arange(1, e.steps + 1) if e.time is None else e.time for e in experiments]
+    if len({t.dtype.kind for t in own}) > 1:
+        own = [t.astype(str) for t in own]
+    further: dict[str, tuple[list[str], np.ndarray, dict[str, Any]]] = {
+        EXPERIMENT: (["row"], np.repeat(names, [int(s.sum()) for s in seen]), {}),
+        "time": (["row"], np.concatenate([t[s] for t, s in zip(own, seen, strict=True)]), {}),
+    }
+    return values, Rows(("row",), None, further)
 
 
 def _room(like: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -43,7 +43,13 @@ from ssmppl.inference.preparation.space import Space, free_components, space_of
 from ssmppl.inference.run.convergence import ESS, convergence_attributes, have_converged
 from ssmppl.inference.run.draws import stack
 from ssmppl.inference.run.executors import check_executor
-from ssmppl.inference.run.labels import Labels, check_names, model_attributes, observes
+from ssmppl.inference.run.labels import (
+    Labels,
+    check_names,
+    measured_rows,
+    model_attributes,
+    observes,
+)
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.inference.updates.independence import AHEAD, PREPARING
@@ -138,10 +144,11 @@ def sample(
           resampled in place of acceptance_rate) or update_rate and
           ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
         * log_likelihood (PMMH; ISMCMC; Gibbs, MetropolisHastings and PGAS by their setting
-          `log_likelihood=True`): log p(y_t | y_1:t-1, theta). `az.loo` and `az.compare` take each
-          row's for that of an observation given all others, which it is not: what they print is
-          the score of one-step predictions with parameters that know the row itself, less a
-          correction for that, and says little of rows to come. `ssm.leave_future_out` does;
+          `log_likelihood=True`): log p(y_t | y_1:t-1, theta) of the rows that were measured, along
+          `time`, of several experiments with different rows along `row`. `az.loo` and `az.compare`
+          take each row's for that of an observation given all others, which it is not: what they
+          print is the score of one-step predictions with parameters that know the row itself, less
+          a correction for that, and says little of rows to come. `ssm.leave_future_out` does;
         * observed_data, constant_data (inputs).
 
         Attributes name method, settings, seed, versions, the plan, and the time taken; after PGAS
@@ -328,16 +335,17 @@ def _to_arviz(
     if states:
         each = [unpack_states(trace, drawn[f"path_{i}"]) for i in numbers]
         paths = labels.together(each, leading=3)
-    log_likelihood = None
-    if "increment_0" in drawn:  # 0.0 of a row that is not there, as of one that was not measured
-        increments = [{"y": drawn[f"increment_{i}"]} for i in numbers]
-        log_likelihood = labels.together(increments, leading=3, missing=0.0)
+    found = None
+    if "increment_0" in drawn:
+        increments = [drawn[f"increment_{i}"] for i in numbers]
+        found = measured_rows(labels, problem.experiments, increments)
     return to_inference_data(
         posterior=posterior | paths,
         sample_stats=stats,
         observed_data=labels.together([e.observed for e in problem.experiments]),
         constant_data=labels.together([e.inputs for e in problem.experiments]) or None,
-        log_likelihood=log_likelihood,
+        log_likelihood={"y": found[0]} if found else None,
+        rows=found[1] if found else None,
         over_time=paths,
         **labels.arguments,
         attrs=attrs | labels.attrs,
