@@ -41,14 +41,26 @@ def split(data: Any, named: Sequence[str], by: str | None, argument: str) -> Lab
 
     Raises
     ------
-    DataError : there are none, or the column is not there.
+    DataError : the column is not there, or a label stands for two of them.
     """
+    found = _split(data, named, by, argument)
+    labels = [str(k) for k, _ in found or () if k is not None]
+    for k in labels:
+        if labels.count(k) > 1:
+            raise DataError(
+                f"two experiments of {argument} are called {k!r}",
+                fix="give each a name of its own",
+            )
+    return found
+
+
+def _split(data: Any, named: Sequence[str], by: str | None, argument: str) -> Labelled | None:
     if isinstance(data, (list, tuple)):
         parts = [(None, d) for d in data]
         return _split_parts(parts, by, argument) if by else parts
     if isinstance(data, Mapping) and data and not set(map(str, data)) & set(named):
         if all(is_table(d) or is_dataset(d) or isinstance(d, Mapping) for d in data.values()):
-            return list(data.items())
+            return [(_plain(k), d) for k, d in data.items()]
     if is_dataset(data) and EXPERIMENT in data.dims:
         return _of_dataset(data)
     return _long(data, by, argument) if by else None
@@ -148,7 +160,9 @@ def _absent(labels: np.ndarray) -> np.ndarray:
 
 
 def _plain(label: Any) -> Any:
-    return label.item() if isinstance(label, np.generic) else label
+    """A label as a coordinate can hold it: a number, a text, None, or what else it is in words."""
+    value = label.item() if isinstance(label, np.generic) else label
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def _check_labels(labels: Sequence[Any], by: str, argument: str) -> None:

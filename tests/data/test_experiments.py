@@ -195,6 +195,9 @@ REFUSED = {
     "levels of an index": (
         PLAIN, LONG.set_index(["tree", "time"]), "several levels", "experiment='tree'"
     ),
+    "a label twice": (
+        TREES, [LONG, LONG[:5]], "two experiments of data are called 'oak'", "of its own"
+    ),
     "no data sets": (PLAIN, [], "empty list", "at least one"),
 }  # fmt: skip
 
@@ -213,6 +216,17 @@ def test_the_place_of_a_fault_has_the_label():
     broken.loc[15, "y"] = np.inf
     with pytest.raises(ssm.DataError, match=r"experiment 'elm', 'y', row 4 \(time 1998\)"):
         ssm.log_likelihood(TREES, broken, THETA)
+
+
+def test_labels_of_any_kind_are_kept_in_words():
+    data = {
+        ("north", 1): {"y": np.zeros(2)},
+        pd.Timestamp("2024-01-01"): {"y": np.zeros(2)},
+        7: {"y": np.zeros(2)},
+    }
+    found = ssm.sample(PLAIN, data, **SHORT)["posterior"]["experiment"].values.tolist()
+    assert found == ["('north', 1)", "2024-01-01 00:00:00", "7"]
+    assert ssm.forecast(PLAIN, THETA, 1, data=data, draws=2, experiment=7, seed=1)["y"].ndim == 2
 
 
 @pytest.mark.parametrize("given", ["", 3, ["tree"]])
