@@ -8,7 +8,7 @@ from model import pendulum
 import ssmppl as ssm
 
 data = pd.read_csv(Path(__file__).with_name("data.csv"), index_col="time")
-idata = ssm.sample(pendulum, data, draws=1500, warmup=500, thin=2, seed=1)
+idata = ssm.sample(pendulum, data, draws=2500, warmup=1000, thin=2, seed=1)
 table = ssm.summary(idata)
 table.insert(0, "truth", pd.Series({"k": 15.0, "c": 0.4, "b": 8.0, "q": 0.2}))
 print(table.round(3), "\n")

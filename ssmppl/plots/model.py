@@ -61,7 +61,8 @@ def plot_model(model: Model, *, graphviz: bool = False, ax: Any = None) -> Any:
 
     Returns
     -------
-    Axes, or a `graphviz.Source`
+    Axes
+        Or a `graphviz.Source`.
 
     Raises
     ------

@@ -15,7 +15,9 @@ the states change, row by row, is their diagnostic.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,6 +40,19 @@ PIECE = 2**25  # bytes of draws that are looked at together
 FEWEST_FOR_RATES = 50  # draws of a chain from which rates are worth a warning
 
 
+_unjudged: ContextVar[bool] = ContextVar("unjudged", default=False)
+
+
+@contextlib.contextmanager
+def unjudged() -> Iterator[None]:
+    """Chains are not judged by the rule: what they are for has an error of its own."""
+    token = _unjudged.set(True)
+    try:
+        yield
+    finally:
+        _unjudged.reset(token)
+
+
 def convergence_attributes(
     labels: list[str], draws: np.ndarray, interrupted: bool, advice: str, warmup: int
 ) -> dict[str, str]:
@@ -48,7 +63,7 @@ def convergence_attributes(
     besides more draws.
     """
     chains, n, _ = draws.shape
-    if interrupted or n < FEWEST or not labels:
+    if interrupted or n < FEWEST or not labels or _unjudged.get():
         return {}
     if chains < LEAST_CHAINS:
         text = (
@@ -72,7 +87,7 @@ def _how_far(labels: list[str], found: np.ndarray, bad: np.ndarray) -> str:
     others = int(bad.sum()) - 1
     more = f"; {others} other parameter{'s fall' if others > 1 else ' falls'} short too"
     return (
-        f"the chains have not converged: R-hat of {labels[worst]} is {r_hat:.4g} (below {R_HAT:g} "
+        f"the chains have not converged: R-hat of {labels[worst]} is {r_hat:.5g} (below {R_HAT:g} "
         f"is needed), its bulk ESS {bulk:.3g} and its tail ESS {tail:.3g} (at least {ESS:g} of "
         f"each){more if others else ''}. "
     )

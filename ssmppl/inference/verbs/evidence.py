@@ -41,6 +41,7 @@ from ssmppl.inference.preparation.exact_models import exact_log_likelihood, exac
 from ssmppl.inference.preparation.pilot import find_mode, tune_particles
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.preparation.space import Space, space_of
+from ssmppl.inference.run.convergence import unjudged
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -161,7 +162,7 @@ def evidence(
             f"too few to fit a distribution of {d} number{'s' if d > 1 else ''} to",
             fix=f"give at least {-(-2 * POINTS * (d + 1) // chains)} draws",
         )
-    with noticed():
+    with noticed(), unjudged():  # its own error counts effective draws
         result = sample(
             model, data, chosen, draws=draws, warmup=warmup, chains=chains, start=start,
             fixed=fixed, states=False, seed=seed, executor=executor, progress=progress,

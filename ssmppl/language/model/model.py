@@ -58,9 +58,10 @@ class Model:
         taken as they are.
     experiment : name of the column that tells several experiments of a long table apart, each with
         an initial state of its own; results call them by its values.
-    dims : names of the axes of vectors and matrices, by quantity (``{"effect": ["season"]}``),
-        which results have in place of `effect_dim_0`.
-    coords : the labels of the components along such a dim (``{"season": ["winter", ...]}``).
+    coords : the labels of the components of vectors and matrices along a dim of `dims`
+        (``{"season": ["winter", ...]}``).
+    dims : names of their axes, by quantity (``{"effect": ["season"]}``), which results have in
+        place of `effect_dim_0`.
 
     Examples
     --------

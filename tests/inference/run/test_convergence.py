@@ -15,9 +15,11 @@ from ssmppl.inference.run.convergence import (
     have_converged,
     rank_r_hat,
     tail_ess,
+    unjudged,
 )
 from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.verbs.sample import METHODS
+from tests.models import standard as models
 
 
 def chains(rho: float, n: int, apart: float = 0.0, seed: int = 1, m: int = 4) -> np.ndarray:
@@ -109,6 +111,18 @@ def test_when_there_is_no_warning():
     assert not warned(bad[:, :99, None])
     assert not warned(np.empty((4, 400, 0)))
     assert not warned(np.ones((4, 400, 1)))
+
+
+def test_what_has_an_error_of_its_own_is_not_judged():
+    """`evidence` draws its proposal from chains, and counts their effective draws itself."""
+    bad = chains(0.0, 400, apart=1.0)[:, :, None]
+    with unjudged():
+        assert not warned(bad)
+    assert warned(bad)
+    data = {"y": ssm.simulate(models.stationary, steps=30, seed=1)["y"].values[0]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        ssm.evidence(models.stationary, data, draws=100, warmup=50, seed=1, progress=False)
 
 
 def test_one_chain_has_no_r_hat():
