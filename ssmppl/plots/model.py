@@ -127,10 +127,11 @@ def _drawn(graph: ModelGraph, plan: Plan, ax: Any) -> Any:
     ax.set_axis_off()
     top = ROOM * lines + GAP * bool(lines)
     places: dict[str, tuple[float, float]] = {}
+    each = -(-len(parameters) // max(lines, 1))
     for k, node in enumerate(parameters):
-        row, column = divmod(k, IN_A_ROW)
-        count = min(len(parameters) - row * IN_A_ROW, IN_A_ROW)
-        places[node.key] = ((column + 0.5) / count, ROOM * (row + 0.5))
+        row, column = divmod(k, each)  # rows are staggered, so that arrows pass between
+        across = (column + 0.5 + 0.5 * (row % 2)) / (each + 0.5 * (lines > 1))
+        places[node.key] = (across, ROOM * (row + 0.5))
     for role, nodes in columns.items():
         step = ROOM * high / max(len(nodes), 1)
         for k, node in enumerate(nodes):
@@ -139,7 +140,7 @@ def _drawn(graph: ModelGraph, plan: Plan, ax: Any) -> Any:
     middle = 0.5 * (COLUMNS[BEFORE] + COLUMNS[STATE])
     behind = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
     ax.text(middle, top + 0.3, likelihood_of(plan), ha="center", va="center", color=MAIN,
-            fontsize=8.0, zorder=3, bbox=behind)  # fmt: skip
+            fontsize=8.0, zorder=5, bbox=behind)  # fmt: skip
     derived = derived_of(plan)
     boxes = {
         node.key: ax.text(
@@ -196,7 +197,7 @@ def _arrow(
             "connectionstyle": "arc3,rad=0.35" if same and abs(y0 - y1) > ROOM else "arc3,rad=0",
             "mutation_scale": 9.0, "alpha": 0.8 if role == PARAMETER else 1.0,
         },
-        zorder=2,
+        zorder=4,  # after the boxes, which know their size once they are drawn
     )  # fmt: skip
 
 
