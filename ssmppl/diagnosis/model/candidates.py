@@ -228,8 +228,11 @@ def _reason(effect: Effect, part: Part, equations: Equations, scales: Scales) ->
     if found:
         return found
     if effect.requires == "additive":
-        scale = scale_of_mean(equations.law(part))
-        return "" if scale == "identity" else "increments of its mean act on another scale"
+        law = equations.law(part)
+        scale = scale_of_mean(law)
+        kind = "logit" if scale == "logit" else "logarithm"
+        act = f"its distribution is {type(law).__name__}: effects act on the {kind} of its mean"
+        return "" if scale == "identity" else act
     if effect.requires:
         low, high = (scales.scale[part.label].quantile(level) for level in (0.02, 0.98))
         if effect.requires == "positive" and low <= 0.0:

@@ -248,7 +248,7 @@ def test_what_a_law_cannot_carry_is_refused():
     assert "variance follows from its mean" in reasons["heteroscedastic noise", "cases"]
     assert "Dirac" in reasons["heteroscedastic noise", "log_s"]
     for name in ("quantisation", "sensor rectification"):  # of a count's logarithm
-        assert "another scale" in reasons[name, "cases"]
+        assert "Poisson: effects act on the logarithm" in reasons[name, "cases"]
     assert in_equations("gap", "two_tanks", "extra loss") == {"h1", "h2"}
     assert not in_equations("gap", "oscillator", "extra loss")
 
