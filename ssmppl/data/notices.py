@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data.binding import Experiment, unread
-from ssmppl.data.times import spacing
+from ssmppl.data.times import spacing, trading_days
 from ssmppl.errors import warn
 from ssmppl.language.checks.ranges import beyond_range
 from ssmppl.language.model.trace import Trace
 
-LEAST_DAYS = 10  # rows from which a week has shown
 OF_TIME = re.compile(
     r"(?i)(.*_)?(date|time|datetime|timestamp|day|week|month|quarter|year)s?(_.*)?"
 )
@@ -57,23 +56,13 @@ def _steps(trace: Trace, experiments: Sequence[Experiment]) -> list[str]:
     if trace.time_step is not None:
         return []
     for e in experiments:
-        found = "" if e.time is None or _trading_days(e.time) else spacing(e.time)
+        found = "" if e.time is None or trading_days(e.time) else spacing(e.time)
         if found:
             return [
                 f"the steps of the data are {found}. Give absent rows with NaN for what was not "
                 'measured, or declare ssm.Model(..., time_step="dt")'
             ]
     return []
-
-
-def _trading_days(time: np.ndarray) -> bool:
-    """Whether rows are days without their weekends, as of markets: nothing is absent then that is
-    expected."""
-    if time.dtype.kind != "M" or len(time) < LEAST_DAYS:
-        return False
-    days = time.astype("datetime64[D]")
-    one = np.median(np.diff(days)) == np.timedelta64(1, "D")
-    return bool(one and np.all(np.is_busday(days)))
 
 
 def _empty(trace: Trace, experiments: Sequence[Experiment]) -> list[str]:

@@ -22,6 +22,7 @@ _OTHER_DATES = re.compile(
 _NUMERAL = re.compile(r"\s*(?!\d{8}\s*$)\d+\s*$")  # 1200 is a name or a number, 20210104 a date
 _OFFSET = re.compile(r"(?i)\d(?:Z|[+-]\d\d(?::?\d\d)?)\s*$")  # behind a clock
 EVEN = 1.2  # months and years are not all as long as each other, and are even all the same
+LEAST_DAYS = 10  # rows from which a week has shown
 
 
 def label_text(label: Any) -> str:
@@ -83,6 +84,16 @@ def _has_zone(date: Any) -> bool:
     if isinstance(date, str):
         return ":" in date and _OFFSET.search(date) is not None
     return getattr(date, "tzinfo", None) is not None
+
+
+def trading_days(time: np.ndarray) -> bool:
+    """Whether rows are days without their weekends, as of markets: nothing is absent then that is
+    expected, on holidays neither."""
+    if time.dtype.kind != "M" or len(time) < LEAST_DAYS:
+        return False
+    days = time.astype("datetime64[D]")
+    one = np.median(np.diff(days)) == np.timedelta64(1, "D")
+    return bool(one and np.all(np.is_busday(days)))
 
 
 def spacing(time: np.ndarray) -> str:

@@ -28,7 +28,7 @@ from ssmppl.analysis.structure import (
 from ssmppl.arguments import checked
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
-from ssmppl.data.times import label_text, spacing
+from ssmppl.data.times import label_text, spacing, trading_days
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.batched.extended import Extended
@@ -360,7 +360,9 @@ def _labels(trace: Trace, experiments: Sequence[Experiment]) -> tuple[tuple[str,
     if not times:
         return ()
     ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
-    uneven = next((found for t in times if (found := spacing(t))), "")
+    uneven = next((found for t in times if (found := spacing(t)) and not trading_days(t)), "")
+    if not uneven and any(map(trading_days, times)):
+        uneven = "days without weekends, one row is one step"
     if trace.time_step is not None:
         name, unit = trace.time_step
         unit = f", in {unit}" if any(t.dtype.kind == "M" for t in times) else ""

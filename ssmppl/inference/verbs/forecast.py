@@ -23,7 +23,7 @@ from ssmppl.data import (
 from ssmppl.data.experiments import EXPERIMENT, TIMES, experiments_of
 from ssmppl.data.parameters import pack, pack_states
 from ssmppl.data.time_steps import lengths
-from ssmppl.data.times import label_text, spacing
+from ssmppl.data.times import label_text, spacing, trading_days
 from ssmppl.errors import ArgumentError, listing, warn
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
@@ -351,6 +351,8 @@ def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
     """Labels of the rows that follow `time`: numbers and dates go on where they are evenly spaced
     (dates also by months and the like), else there are row numbers.
 
+    Days of a market go on without weekends; which holidays are to come is not known.
+
     zone : that dates, which are in UTC, were given in: steps of whole days and longer are those of
         its calendar.
     """
@@ -363,6 +365,10 @@ def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
         regular = pd.DatetimeIndex(time, freq="infer").freq if len(time) > 2 else None
         if regular is not None:
             return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=regular)[1:])
+        if trading_days(time):
+            days = time.astype("datetime64[D]")
+            following = np.busday_offset(days[-1], count, roll="forward")
+            return np.asarray(following + (time[-1] - days[-1]))
         if len(time) > 2:
             warn(
                 "the dates of the data are not evenly spaced, so that the rows of the forecast are "

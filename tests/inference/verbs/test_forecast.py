@@ -157,6 +157,17 @@ def test_one_of_several_experiments():
         ssm.forecast(model(), made(), inputs={"u": FUTURE}, experiment=3)
 
 
+def test_days_of_a_market_go_on_without_weekends():
+    """Holidays among them are no gaps in what was measured."""
+    days = pd.bdate_range("2024-03-25", periods=14).delete([4, 5]) + pd.Timedelta(hours=16)
+    found = after(days.to_numpy(), 3)
+    assert found.astype("datetime64[h]").astype(str).tolist() == [
+        "2024-04-12T16", "2024-04-15T16", "2024-04-16T16",
+    ]  # fmt: skip
+    with pytest.warns(UserWarning, match="not evenly spaced"):
+        after(days.to_numpy()[:8], 1)  # a week has not shown
+
+
 def test_time_goes_on():
     months = pd.date_range("2020-01-31", periods=4, freq="ME").to_numpy()
     assert after(months, 2).astype("datetime64[D]").astype(str).tolist() == [
