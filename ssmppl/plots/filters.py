@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.drawing.style import DATA, FAINT, MAIN, OTHER, bare
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, listing
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.plots.drawing import few, handed, key, only_below, panels, shown_time, styled
 from ssmppl.plots.reading import components, experiment_name, is_dataset, pick, wrong_kind
@@ -163,7 +163,7 @@ def resampled(one: Any, draw: int = 0) -> np.ndarray | None:
 
 @styled
 def plot_ancestry(
-    result: Any, *, var_names: Any = None, draw: int = 0, experiment: int | None = None,
+    result: Any, *, var_names: Any = None, draw: int = 0, experiment: Any = None,
     ax: Any = None,
 ) -> Any:  # fmt: skip
     """The genealogy of the particles: lines from each to its ancestor, survivors drawn strongly.
@@ -180,7 +180,7 @@ def plot_ancestry(
         does not hold the particles.
     var_names : states that are drawn, or components; None: all.
     draw : which of the repeats, from 0.
-    experiment : which one, from 1, where there are several.
+    experiment : which one, where there are several: its label, or its number from 1.
     ax : Matplotlib axes, as many as there are states; None: a new figure.
 
     Returns
@@ -192,7 +192,7 @@ def plot_ancestry(
     ------
     ArgumentError : the result does not hold the particles; an unknown state, repeat or experiment.
     """
-    one = _chosen(filtered(result, "plot_ancestry"), experiment)
+    one = _chosen(result, filtered(result, "plot_ancestry"), experiment)
     if "particle_ancestor" not in one:
         raise ArgumentError(
             "the result of the filter does not hold its particles and their ancestors",
@@ -227,7 +227,15 @@ def plot_ancestry(
     return handed(axes)
 
 
-def _chosen(found: list[Any], experiment: int | None) -> Any:
+def _chosen(result: Any, found: list[Any], experiment: Any) -> Any:
+    if isinstance(result, Mapping) and not is_dataset(result):
+        if experiment in result:
+            return result[experiment]
+        raise ArgumentError(
+            f"experiment={experiment!r}, and the result is of "
+            f"{listing(str(experiment), map(str, result))}",
+            fix="give the label of one of them",
+        )
     if experiment is None and len(found) == 1:
         return found[0]
     if experiment is None or not 1 <= experiment <= len(found):

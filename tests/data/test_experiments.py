@@ -164,6 +164,13 @@ def test_panels_are_titled_by_the_labels():
         assert [t for t in titles if t in YEARS] == list(YEARS)
 
 
+def test_ancestry_of_one_of_them():
+    found = ssm.particle_filter(TREES, LONG, THETA, particles=20, history=True, seed=1)
+    ssm.plot_ancestry(found, experiment="elm")
+    with pytest.raises(ssm.ArgumentError, match="result is of elm, oak, ash"):
+        ssm.plot_ancestry(found)
+
+
 @pytest.mark.parametrize("kind", ["dates", "none", "one without", "texts", "alike"])
 def test_labels_of_rows_of_each(kind, tmp_path):
     y = [np.zeros(3), np.zeros(2)]

@@ -96,7 +96,8 @@ def sample(
     Parameters
     ----------
     model : the model, as declared.
-    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    data : mapping of arrays, pandas DataFrame or xarray Dataset; of several experiments a
+        dictionary of those by label, a list, or a long table with the model's column `experiment`.
     method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models and for those
         of finitely many states, `ssm.MetropolisHastings(...)` where states have no noise too,
         `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.

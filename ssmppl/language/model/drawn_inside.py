@@ -23,9 +23,10 @@ from ssmppl.language.distributions.base import DistributionAsNumber
 from ssmppl.language.model.closure_digest import plain_function
 
 # Functions whose arguments may be distributions.
-_TAKE_DISTRIBUTIONS = ("Mixture", "Truncated", "ZeroInflated", "Rounded")
+_TAKE_DISTRIBUTIONS = ("Mixture", "Truncated", "ZeroInflated")
 LONGEST = 80  # characters of a line
-_CAPITALISED = re.compile(r"\b([A-Z]\w+)\b")
+# The type of an operand in messages of Python and NumPy; other words may be the user's own.
+_TYPE = re.compile(r"'([A-Z]\w+)'|\btype ([A-Z]\w+)\b")
 
 
 def computed_with(
@@ -50,7 +51,7 @@ def _kind(error: Exception, known: Set[str]) -> str | None:
         return type(error.obj).__name__ if isinstance(error.obj, Distribution) else None
     if not isinstance(error, TypeError):
         return None
-    met = [word for word in _CAPITALISED.findall(str(error)) if word in known]
+    met = [a or b for a, b in _TYPE.findall(str(error)) if (a or b) in known]
     return met[-1] if met else None
 
 
@@ -112,6 +113,8 @@ def _rewritten(function: Callable[..., Any], role: str, suffix: str, candidates:
     if len(assigned) < len(before) or any(
         len(s.targets) > 1 or not isinstance(s.targets[0], ast.Name) for s in assigned
     ):
+        raise _NotSimple
+    if len({_target(s) for s in assigned}) < len(assigned) or tree.args.defaults:
         raise _NotSimple
     draws: list[_Taken] = []
     for s in assigned:

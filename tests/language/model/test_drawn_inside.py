@@ -256,6 +256,34 @@ def test_functions_that_cannot_be_taken_apart(tmp_path):
     assert "NAME_next" in error.fix
 
 
+@pytest.mark.parametrize(
+    ("arguments", "lines"),
+    [
+        ("S, I, p, scale=2.0", "new = ssm.Binomial(S, p / scale)"),
+        ("S, I, p", "new = ssm.Binomial(S, p)\n            new = ssm.Binomial(S, 0.5 * p)"),
+    ],
+)
+def test_what_a_rewritten_function_would_lose_is_not_rewritten(tmp_path, arguments, lines):
+    """A default, or a name that is given twice."""
+    error = refused(tmp_path, PRIOR, f"""
+        @m.transition
+        def step({arguments}):
+            {lines}
+            return {{"S": ssm.Dirac(S - new), "I": ssm.Dirac(I)}}
+        """)  # fmt: skip
+    assert "'new', a Binomial distribution" in error.found
+    assert "\n" not in error.fix
+
+
+def test_an_error_of_the_users_own_is_told_as_it_is(tmp_path):
+    error = refused(tmp_path, PRIOR, """
+        @m.transition
+        def step(S, I, p):
+            raise TypeError("Gamma and Beta rays are not modelled")
+        """)  # fmt: skip
+    assert "raised TypeError: Gamma and Beta rays" in error.found
+
+
 def test_distributions_are_still_what_mixtures_are_made_of(tmp_path):
     model = run(tmp_path, REST, PRIOR, """
         @m.transition
