@@ -132,6 +132,9 @@ def test_all_are_forecast_together(tmp_path):
         assert np.abs(step).max() < 8.0 * np.sqrt(own["q"].values.max())
     with pytest.raises(ssm.ArgumentError, match="draws one experiment"):
         ssm.plot_forecast(every, idata)
+    twins = ssm.forecast(PLAIN, THETA, 3, data=dict.fromkeys("ab", FRAMES["elm"]), draws=50, seed=1)
+    noise = twins["y"].values - twins["x"].values  # of the sensor: each has its own
+    assert abs(np.corrcoef(noise[:, 0].ravel(), noise[:, 1].ravel())[0, 1]) < 0.5
 
 
 def test_inputs_of_the_rows_to_come_of_each():

@@ -101,3 +101,15 @@ def test_a_verb_that_samples_from_parts_of_the_data_notices_once():
     assert [s for s in said(level(), late, shortly) if "missing in every row" in s] == []
     found = said(level(), table(date=DATES), evidence)
     assert len([s for s in found if "the column 'date'" in s]) == 1
+
+
+def test_days_of_a_market_are_called_so_by_explain():
+    days = pd.bdate_range("2024-03-25", periods=14).delete([4, 5])
+    model = ssm.Model("returns")
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.9 * x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    text = str(ssm.explain(model, pd.DataFrame({"y": np.zeros(12)}, index=days)))
+    assert "days without weekends, one row is one step" in text
+    every = pd.date_range("2024-03-25", periods=12)
+    assert "weekends" not in str(ssm.explain(model, pd.DataFrame({"y": np.zeros(12)}, index=every)))

@@ -424,6 +424,31 @@ def test_other_laws_of_noises_are_refitted_where_one_gains_most(first, expected)
     assert other_noise_laws(screen, refits) == expected
 
 
+def test_other_laws_of_noises_are_among_the_single_refits(monkeypatch):
+    """The screen has the growing variance first; outliers, behind it, gain far more."""
+    screen = screen_of([5.0, 3.0], np.eye(2), "nn")
+    for c, name in zip(screen.design.candidates, ["growing", "outliers"], strict=True):
+        c.effect.name, c.equation = name, "y1"
+    gains = {0: 24.0, 1: 71.0}
+
+    def fitted(augmented, base, screen, sets, *_, **__):
+        ones = [(k, screen.design.candidates[k]) for (k,) in sets]
+        return [Refit((k,), (c,), None, None, gains[k]) for k, c in ones], []
+
+    monkeypatch.setattr(module, "refit_all", fitted)
+    monkeypatch.setattr(module, "leading", lambda screen: [0])
+    for name in ("correlated_candidates", "delays"):
+        monkeypatch.setattr(module, name, lambda screen, refits: [])
+    monkeypatch.setattr(module, "one_signed_candidates", lambda screen: [])
+    monkeypatch.setattr(EffectSelection, "_delayed", lambda *_: [])
+    monkeypatch.setattr(EffectSelection, "_overlooked", lambda *_: [])
+    out = SelectionResult(None)
+    EffectSelection(None, screen, (), seed_sequence(1), 0.05, Checkpoint(None, {}))._refit_singles(
+        out
+    )
+    assert [r.index for r in out.refits] == [(1,), (0,)]
+
+
 @pytest.mark.parametrize(
     ("cause", "gain", "ahead", "expected"),
     [

@@ -155,6 +155,17 @@ def test_what_has_no_approximation_is_refused():
             ssm.sample(model, {"y": np.ones(5)}, method, draws=5, warmup=5, **QUIET)
 
 
+def test_runs_too_short_to_meet_the_rule_do_not_go_on(monkeypatch):
+    """What they return could not have the effective sample sizes however long they went on."""
+    y = ssm.simulate(models.stationary, steps=20, seed=2)["y"].values[0]
+    monkeypatch.setattr(verb, "have_converged", lambda chains, free: False)
+    options = {"warmup": 30, "chains": 2, "states": False, **QUIET}
+    short = ssm.sample(models.stationary, {"y": y}, draws=399, **options)
+    assert "further_draws" not in short["posterior"].attrs
+    long = ssm.sample(models.stationary, {"y": y}, draws=400, **options)
+    assert long["posterior"].attrs["further_draws"] == 8 * 400
+
+
 @pytest.mark.parametrize("kept", [False, True], ids=["in memory", "checkpoint"])
 def test_chains_that_have_not_converged_go_on(monkeypatch, tmp_path, kept):
     y = ssm.simulate(models.stationary, steps=20, seed=2)["y"].values[0]

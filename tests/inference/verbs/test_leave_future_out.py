@@ -196,3 +196,20 @@ def test_parameters_that_are_all_fixed_leave_nothing_to_integrate_out():
     model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     with pytest.raises(ArgumentError, match="no parameter is free"):
         ssm.leave_future_out(model, {"y": np.zeros(9)}, fixed={"q": 1.0})
+
+
+def test_particles_of_two_experiments_are_their_own():
+    """Equal data, and estimates that differ by the noise of the filters."""
+    model = ssm.Model("counts")
+    model.prior(lambda: {"q": ssm.Gamma(2, rate=10)})
+    model.initial(lambda: {"x": ssm.Normal(1, sd=1)})
+    model.transition(lambda x, q: {"x": ssm.Normal(0.9 * x, variance=q)})
+    model.observation(lambda x: {"y": ssm.Poisson(np.exp(x))})
+    data = [{"y": [2, 4, 3, 1, 2]}] * 2
+    found = ssm.leave_future_out(
+        model, data, first=3, draws=50, warmup=50, chains=2, particles=20, seed=1, progress=False,
+        method=ssm.PMMH(particles=20),
+    )  # fmt: skip
+    one, other = found["elpd"].values
+    assert np.all(one != other)
+    np.testing.assert_allclose(one, other, atol=1.0)
