@@ -13,6 +13,7 @@ from ssmppl.data import unpack_parameters
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.preparation.space import free_components
+from ssmppl.language.model.component_names import ComponentNames
 from ssmppl.language.model.trace import Trace
 from ssmppl.results import to_dataset
 
@@ -33,7 +34,8 @@ class Estimate:
     ----------
     parameters : value of every parameter by name, the fixed ones too: a number, or an array of the
         prior's shape.
-    covariance : of the free components, labelled as `phi`, `A[0, 1]`: the inverse of the observed
+    covariance : of the free components, labelled as `phi`, `A[0, 1]` (or by the names that the
+        model gives them): the inverse of the observed
         information. NaN where the information is not positive definite; `attrs["covariance"]` then
         says so. NaN too for a component whose maximum is at an edge of its support
         (`attrs["held_at_edge"]`, exact models only): the others' is that with it held there.
@@ -46,6 +48,7 @@ class Estimate:
         posterior was maximised. Where a parameter has such a name, an underscore follows theirs.
     attrs : method, why it was taken, `converged`, `interrupted`, seed, seconds; where random
         numbers were used, `monte_carlo_errors`: the estimate's own standard errors by component.
+    names : of the components.
     """
 
     parameters: dict[str, float | np.ndarray]
@@ -54,6 +57,7 @@ class Estimate:
     log_likelihood: float
     iterates: xr.Dataset
     attrs: dict[str, Any] = field(default_factory=dict)
+    names: ComponentNames = field(default_factory=ComponentNames)
 
     def __repr__(self) -> str:
         lines, rows = [*self._head(), ""], self._rows()
@@ -109,12 +113,12 @@ class Estimate:
         for name, value in self.parameters.items():
             errors = self.standard_errors.get(name)
             for index in np.ndindex(np.shape(value)):
-                label = name + (f"[{', '.join(map(str, index))}]" if index else "")
+                label = self.names.label(name, index)
                 row = {"estimate": float(np.asarray(value)[index])}
                 row["standard_error"] = 0.0 if errors is None else float(np.asarray(errors)[index])
                 if noise:
-                    lower = ", ".join(map(str, sorted(index, reverse=True)))
-                    row["monte_carlo_error"] = noise.get(label, noise.get(f"{name}[{lower}]", 0.0))
+                    lower = self.names.label(name, sorted(index, reverse=True))
+                    row["monte_carlo_error"] = noise.get(label, noise.get(lower, 0.0))
                 rows[label] = row
         return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -172,7 +176,7 @@ def _edges(trace: Trace, theta: np.ndarray, errors: np.ndarray) -> dict[str, flo
         for s, *own in zip(site.value.ravel(), *ends, strict=True):
             for edge in evaluate(own, env):
                 if abs(env[s] - float(edge)) < spread[s]:
-                    found[repr(s)] = float(edge)
+                    found[trace.label(s)] = float(edge)
     return found
 
 
@@ -218,4 +222,5 @@ def make_estimate(
             attrs={k: v for k, v in attrs.items() if v is not None},
         ),
         attrs=attrs,
+        names=trace.component_names,
     )

@@ -157,7 +157,8 @@ def maximize(
     value = _log_likelihood(setup, ascent, attrs)
     covariance = _covariance(setup, ascent, attrs)
     if ascent.error is not None:
-        labels, errors = map(repr, problem.trace.parameter_symbols), np.diagonal(ascent.error)
+        trace, errors = problem.trace, np.diagonal(ascent.error)
+        labels = map(trace.label, trace.parameter_symbols)
         free = free_components(problem.trace, fixed_values)
         attrs["monte_carlo_errors"] = {
             label: float(np.sqrt(max(e, 0.0)))
@@ -240,7 +241,8 @@ def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> n
     if found is None and information is not None and not isinstance(setup.exact, NotApplicable):
         found = edges(setup, ascent.theta, information)
     if found is not None:
-        labels = [repr(s) for s in setup.problem.trace.parameter_symbols]
+        trace = setup.problem.trace
+        labels = [trace.label(s) for s in trace.parameter_symbols]
         attrs["held_at_edge"] = {labels[i]: edge for i, edge in found.components.items()}
         if not found.kept.any():
             attrs["covariance"] = "every parameter is at the boundary of its parameter space"

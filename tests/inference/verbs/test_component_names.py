@@ -90,8 +90,24 @@ def test_summaries_and_tables_have_them(named, idata, data):
     found = ssm.maximize(named, data, **QUIET)
     assert "load[rain, winter]" in found.covariance.columns
     assert found.iterates["effect"].dims[-1] == "season"
+    assert list(found.table().index) == list(found.covariance.columns)
+    assert "effect[winter]" in str(found)
     smoothed = ssm.smooth(named, data, found.parameters)
     assert list(state_table(smoothed).columns)[:2] == ["x[winter] mean", "x[winter] sd"]
+
+
+def test_monte_carlo_errors_of_an_estimate_have_them():
+    """They were looked for by number, and would have been 0."""
+    model = ssm.Model("counts", inputs={"u": 2}, dims={"b": ["side"]}, coords={"side": ["l", "r"]})
+    model.prior(lambda: {"b": ssm.Normal(np.zeros(2), sd=1), "q": ssm.Gamma(2, rate=10)})
+    model.initial(lambda: {"x": ssm.Normal(1, sd=0.5)})
+    model.transition(lambda x, q: {"x": ssm.Normal(0.8 * x, variance=q)})
+    model.observation(lambda x, u, b: {"y": ssm.Poisson(np.exp(x + u @ b))})
+    u = np.tile([[1.0, 0.0], [0.0, 1.0]], (15, 1))
+    y = ssm.simulate(model, {"b": [0.5, -0.5], "q": 0.2}, inputs={"u": u}, seed=1)["y"].values[0]
+    found = ssm.maximize(model, {"y": y, "u": u}, **QUIET)
+    assert list(found.table().index) == ["b[l]", "b[r]", "q"]
+    assert (found.table()["monte_carlo_error"] > 0).all()
 
 
 def test_states_of_filters_and_simulations_have_them(named, data):
