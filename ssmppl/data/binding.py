@@ -19,6 +19,7 @@ from ssmppl.counts import check_count
 from ssmppl.data.channels import channel, holds
 from ssmppl.data.defined import check_defined
 from ssmppl.data.parameters import pack
+from ssmppl.data.per_experiment import with_experiment_number
 from ssmppl.data.sources import Source, sources
 from ssmppl.data.time_steps import with_time_step
 from ssmppl.data.values import name_of, number, outside
@@ -26,7 +27,7 @@ from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.distributions.base import Support
-from ssmppl.language.model.trace import Site, Trace
+from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Site, Trace
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,8 @@ def bind(
         {n: site.distribution.support() for n, site in trace.observations.items()},
         tuple(_needed(trace)),
     )
-    given = [with_time_step(trace, s) for s in sources(data, named, by=trace.experiment)]
+    found = [with_time_step(trace, s) for s in sources(data, named, by=trace.experiment)]
+    given = [with_experiment_number(trace, s, k) for k, s in enumerate(found)]
     return [_bind(trace, s, need_observations, steps, common) for s in given]
 
 
@@ -95,50 +97,54 @@ def unread(trace: Trace, data: Any) -> list[str]:
     return [c for c in columns if c not in (*named, "time") and not c.startswith(parts)]
 
 
-def bind_inputs(trace: Trace, inputs: Any, steps: int | None) -> tuple[np.ndarray, int, Source]:
+def bind_inputs(
+    trace: Trace, inputs: Any, steps: int | None, number: float = 0.0
+) -> tuple[np.ndarray, int, Source]:
     """Inputs of a simulation: u (T, U), T, and where they are from, with the labels of the rows.
 
     `inputs` is None or {} for a model without inputs, which needs `steps`; otherwise a data set,
-    whose number of rows is `steps` unless both are given, and then they must agree.
+    whose number of rows is `steps` unless both are given, and then they must agree. `number` is
+    that of the experiment, where parameters are of each.
     """
     if steps is not None:
         check_count("steps", steps, 1)
     if inputs is None:
-        if trace.inputs:
+        if trace.given_inputs:
             names = ", ".join(f"{n!r}: ..." for n in _to_give(trace))
             raise ArgumentError(
                 f"the model {trace.name!r} has inputs, and none were given",
                 fix=f"pass inputs={{{names}}}, one row for each step",
             )
         inputs = {}
-    elif not trace.inputs and isinstance(inputs, dict) and set(inputs) - {"time"}:
+    elif not trace.given_inputs and isinstance(inputs, dict) and set(inputs) - {"time"}:
         raise ArgumentError(
             f"inputs gives {', '.join(map(repr, inputs))}, but the model {trace.name!r} declares "
             "no inputs",
             fix=f"declare them, ssm.Model({trace.name!r}, inputs=({next(iter(inputs))!r},))",
         )
-    found = sources(inputs, trace.inputs, argument="inputs")
+    found = sources(inputs, trace.given_inputs, argument="inputs")
     if len(found) > 1:
         raise ArgumentError(
             f"inputs is a list of {len(found)} data sets",
             fix="simulate one experiment at a time",
         )
-    if steps is None and not trace.inputs and found[0].time is None:
+    if steps is None and not trace.given_inputs and found[0].time is None:
         raise ArgumentError(
             "neither steps nor inputs tell how many rows to simulate", fix="pass steps=100"
         )
     (source,) = found
     source = with_time_step(trace, source)
-    values = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
+    values = {n: channel(source, n, shape, "input") for n, shape in trace.given_inputs.items()}
     rows = _rows(source, values, steps)
     _check_inputs(source, values)
+    values[EXPERIMENT_NUMBER] = np.full(rows, number)
     return _input_array(trace, values, rows), rows, source
 
 
 def _to_give(trace: Trace) -> list[str]:
     """The inputs, with the times of the rows in place of the time step that follows from them."""
     own = None if trace.time_step is None else trace.time_step[0]
-    return ["time" if n == own else n for n in trace.inputs]
+    return ["time" if n == own else n for n in trace.given_inputs]
 
 
 @dataclass(frozen=True)
@@ -182,7 +188,7 @@ def _bind(
         steps=rows,
         partial=frozenset(partial),
         observed={n: observed[n] for n in trace.observations},
-        inputs=inputs,
+        inputs={n: inputs[n] for n in trace.given_inputs},
         zone=source.zone,
         label=source.experiment,
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from ssmppl.compiling import LOCK
 from ssmppl.errors import Location, ModelError, SSMError, listing
-from ssmppl.expressions.arrays import ExprArray
+from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, recording, symbol
 from ssmppl.expressions.node import choosing
 from ssmppl.language.checks.indexes import check_indexes
@@ -31,10 +31,11 @@ from ssmppl.language.checks.rules import (
     check_returned,
     check_states,
 )
+from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.model.calling import call, call_once, check_outer_names, return_location
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
-from ssmppl.language.model.trace import Site, Trace, symbols
+from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Site, Trace, symbols
 from ssmppl.language.user_defined.sde import noises, started
 
 
@@ -43,11 +44,18 @@ def _time(role: str) -> str:
     return "time_prev" if role in ("transition", "proposal") else "time"
 
 
-_traces: weakref.WeakKeyDictionary[Model, tuple[tuple, Trace]] = weakref.WeakKeyDictionary()
+# of a model its signature, and the traces by the labels of the experiments
+_Known = tuple[tuple, dict[tuple[Any, ...], Trace]]
+_traces: weakref.WeakKeyDictionary[Model, _Known] = weakref.WeakKeyDictionary()
 
 
-def trace(model: Model) -> Trace:
+def trace(model: Model, experiments: tuple[Any, ...] = ()) -> Trace:
     """Run the model's functions on symbols.
+
+    Parameters
+    ----------
+    experiments : labels of those that its parameters `per="experiment"` have values for; () where
+        it is a single one.
 
     Raises
     ------
@@ -59,32 +67,43 @@ def trace(model: Model) -> Trace:
             fix="pass the object made by ssm.Model(...), not its name or a function of it",
         )
     signature = model.signature
-    cached = _traces.get(model)
-    if cached is None or cached[0] != signature:
+    found = _kept(model, signature, experiments)
+    if found is None:
         with LOCK:
-            cached = _traces.get(model)
-            if cached is None or cached[0] != signature:
-                _traces[model] = cached = _traced(model)
-    return cached[1]
+            found = _kept(model, signature, experiments)
+            if found is None:
+                signature, found = _traced(model, experiments)
+                known = _traces.get(model)
+                if known is None or known[0] != signature:
+                    _traces[model] = known = (signature, {})
+                known[1][experiments] = found
+    return found
+
+
+def _kept(model: Model, signature: tuple, experiments: tuple[Any, ...]) -> Trace | None:
+    known = _traces.get(model)
+    return known[1].get(experiments) if known is not None and known[0] == signature else None
 
 
 class _Redefined(Exception):
     """A function turned out to be one of before, declared again: the model has changed."""
 
 
-def _traced(model: Model) -> tuple[tuple, Trace]:
+def _traced(model: Model, experiments: tuple[Any, ...]) -> tuple[tuple, Trace]:
     """The trace, and the signature that the model had before: tracing may change what it reads."""
     while True:
         signature = model.signature
         try:
-            return signature, _Tracer(model).run()
+            return signature, _Tracer(model, experiments).run()
         except _Redefined:
             continue
 
 
 class _Tracer:
-    def __init__(self, model: Model):
+    def __init__(self, model: Model, experiments: tuple[Any, ...] = ()):
         self.model = model
+        self.experiments = experiments
+        self.each: dict[str, Location] = {}  # parameters of which each experiment has its own
         self.known: dict[str, tuple[str, tuple[int, ...]]] = {}  # name -> (role, shape)
         self.owner: dict[str, Location] = {}
         self.symmetric: set[str] = set()  # parameters that are symmetric matrices
@@ -103,6 +122,8 @@ class _Tracer:
         for name in model.inputs:
             check_name(name, "input", model.location)
             self._claim(name, "input", model.inputs[name], model.location)
+        if self.experiments and model.per_experiment:
+            self._claim(EXPERIMENT_NUMBER, "input", (), model.location)
         with recording() as locations, choosing() as choices:
             parameters = self._sites("prior", "parameter")
             initial = self._sites("initial", "state")
@@ -115,7 +136,10 @@ class _Tracer:
         initial |= draws
         check_dims(self.known, self.owner)
         shapes = {name: shape for name, (_, shape) in self.known.items()}
-        model.component_names.check(shapes, model.location)
+        names, several = model.component_names, bool(self.experiments and self.each)
+        names.check(shapes | {n: shapes[n][several:] for n in self.each}, model.location)
+        if several:
+            names = names.with_axis(self.each, "experiment", self.experiments, shapes)
         self._check_outer_names()
         self._check_defaults()
         traced = Trace(
@@ -125,10 +149,12 @@ class _Tracer:
             transition=self.new.ordered(initial, transition),
             observations=observations,
             proposal=proposal,
-            inputs=dict(model.inputs),
+            inputs=dict(model.inputs) | ({EXPERIMENT_NUMBER: ()} if several else {}),
             time_step=model.time_step,
             experiment=model.experiment,
-            component_names=model.component_names,
+            component_names=names,
+            per_experiment=tuple(self.each),
+            experiments=self.experiments if several else (),
             locations=locations,
             functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},
             choices=choices,
@@ -157,6 +183,8 @@ class _Tracer:
                 check_read(name, distribution, function_role, self._kinds(function_role), handed)
                 if function_role != "prior":
                     distribution = independent(distribution)
+                elif function in self.model.per_experiment:
+                    distribution = self._of_each(name, distribution, line)
                 if function_role in ("initial", "transition"):
                     find_root(distribution)
                 if name in sites:
@@ -181,6 +209,19 @@ class _Tracer:
                 for name in laws:
                     self.new.give(sites[name])
         return sites
+
+    def _of_each(self, name: str, distribution: Distribution, line: Location) -> Distribution:
+        """The prior of a parameter of which each experiment has its own."""
+        if distribution.joint:
+            raise ModelError(
+                f"{name!r} is of each experiment, and its prior {type(distribution).__name__} is a "
+                "joint one",
+                fix="give its components a distribution each, and make of them what you need where "
+                "they are used, mean + cholesky @ z of standard normal ones",
+                where=line,
+            )
+        self.each[name] = line
+        return distribution.repeated(len(self.experiments)) if self.experiments else distribution
 
     def _before(self, name: str) -> Any:
         """The value of a state at the row before; None where there is none of this name."""
@@ -207,6 +248,13 @@ class _Tracer:
                 raise ModelError(
                     f"@{role} {function.__name__} takes *{name}: arguments are bound by name",
                     fix="name each parameter, state and input that the distribution depends on",
+                    where=where,
+                )
+            if role == "prior" and name in self.each:
+                raise ModelError(
+                    f"@prior {function.__name__} names {name!r}, of which each experiment has its "
+                    f"own ({self.each[name]})",
+                    fix="let priors depend on parameters that all experiments share",
                     where=where,
                 )
             value = self._argument(name, role)
@@ -277,7 +325,21 @@ class _Tracer:
         known_as, shape = self.known[name]
         kind = self._allowed(role)[known_as]
         value = symbols(kind, name, shape, name in self.symmetric)
-        return value[()] if shape == () else value
+        if name in self.each and self.experiments:
+            value = self._of_this(value, role)
+        return value[()] if value.shape == () else value
+
+    def _of_this(self, values: ExprArray, role: str) -> ExprArray:
+        """Of a parameter of each experiment the value of the one at hand.
+
+        A sum has derivatives of one term each, where nested choices have them of all.
+        """
+        number = symbol(self._allowed(role)["input"], EXPERIMENT_NUMBER)
+        own = [
+            array(elementwise("where", elementwise("eq", number, float(k)), v, 0.0))
+            for k, v in enumerate(values)
+        ]
+        return array(sum(own[1:], own[0]))
 
     def _given_by(self, function: Callable[..., Any]) -> Mapping[str, Any]:
         """The distributions that a transition function would return, run on stand-ins for new

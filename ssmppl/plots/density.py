@@ -11,9 +11,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.run.prior import draw_prior
-from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace
-from ssmppl.language.tracing import trace
 from ssmppl.plots.reading import components
 
 __all__ = ["Prior", "estimated", "prior_draws", "priors_of", "supports", "window"]
@@ -70,10 +68,9 @@ def supports(traced: Trace) -> dict[str, tuple[float, float]]:
     return found
 
 
-def priors_of(model: Model) -> dict[str, Prior]:
+def priors_of(traced: Trace) -> dict[str, Prior]:
     """The prior of each component of the parameters: exactly, or by draws where it depends on
     others or is the margin of a joint distribution."""
-    traced = trace(model)
     ends = supports(traced)
     draws: np.ndarray | None = None
     laws = [s.distribution for s in traced.parameters.values()]

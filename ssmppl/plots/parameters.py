@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.data.per_experiment import trace_of_results
 from ssmppl.drawing.numerals import with_error
 from ssmppl.drawing.style import MAIN, OTHER, bare
 from ssmppl.errors import ArgumentError
@@ -93,7 +94,8 @@ def plot_prior_posterior(
 
 def _priors(idata: Any, prior: Any) -> dict[str, Prior]:
     if isinstance(prior, Model):
-        return priors_of(prior)
+        posterior = group(idata, "posterior") if is_inference_data(idata) else None
+        return priors_of(trace_of_results(prior, {} if posterior is None else posterior))
     found = None
     source = idata if prior is None else prior
     if is_inference_data(source):

@@ -14,6 +14,7 @@ from ssmppl.drawing.style import MAIN, OTHER
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.run.problem import pose
+from ssmppl.language.tracing import trace
 from ssmppl.plots.density import estimated, priors_of
 from ssmppl.plots.likelihood import surface
 from tests.plots.results import TRUTH, counts, data, level, maximised, sampled, smoothed
@@ -62,7 +63,7 @@ def test_priors_are_exact_where_they_depend_on_nothing():
     model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
     model.transition(lambda x, m: {"x": ssm.Normal(x + m[0], sd=1)})
     model.observation(lambda x, b, flat: {"y": ssm.Normal(x + flat, sd=b)})
-    found = priors_of(model)
+    found = priors_of(trace(model))
     x = np.linspace(0.01, 4, 50)
     np.testing.assert_allclose(found["a"].density(x), stats.gamma.pdf(x, 3, scale=0.5))
     np.testing.assert_allclose(found["m[1]"].density(x), stats.norm.pdf(x, scale=2.0))

@@ -130,6 +130,14 @@ class Estimate:
             out.append(f"the likelihood is {self.attrs.get('likelihood', 'an approximation')}")
         if "approximate_distributions" in self.attrs:
             out.append(str(self.attrs["approximate_distributions"]))
+        if idle := self.attrs.get("only_in_priors"):
+            out.append(
+                f"{', '.join(idle)}: only priors depend on {'it' if len(idle) == 1 else 'them'}, "
+                "so that the likelihood says nothing and the value is none of the data's; "
+                'objective="posterior", ssm.sample, or a state with that distribution in @initial '
+                "and Dirac of itself in @transition in place of the parameter would estimate "
+                f"{'it' if len(idle) == 1 else 'them'}"
+            )
         if self.attrs.get("interrupted"):
             out.append("interrupted; this is the best point so far")
         elif self.attrs.get("converged") is False:

@@ -17,10 +17,10 @@ from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
 from ssmppl.codegen.modules.program import OWN_MODULES, Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.data.notices import warn_of
+from ssmppl.data.per_experiment import trace_over
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
-from ssmppl.language.tracing import trace
 
 # What filters without particles are called where a proposal is asked for; the last one, of models
 # that call a simulator, is an approximation.
@@ -135,7 +135,7 @@ def pose(model: Model, data: Any, *, noting: bool = False) -> Problem:
     ------
     ModelError, DataError : naming the place, what was found and the fix.
     """
-    traced = trace(model)
+    traced = trace_over(model, data)
     if not traced.observations:
         raise ModelError(
             f"model {traced.name!r} has no @observation function: there is nothing to condition on",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,7 @@ from ssmppl.analysis.structure import (
 from ssmppl.arguments import checked
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
+from ssmppl.data.per_experiment import trace_over
 from ssmppl.data.times import label_text, spacing, trading_days
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
@@ -61,6 +62,9 @@ TEMPERED = (
 )
 
 
+AUXILIARY = "auxiliary variable of the transition, undefined at t = 1"
+
+
 @dataclass(frozen=True)
 class Plan:
     """Everything that was derived from a model; `print` it, or show it in a notebook.
@@ -78,6 +82,7 @@ class Plan:
     laplace : why the likelihood has no Laplace approximation; None where it has, or is exact.
     eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
+    declared : the model as it was declared, where `trace` has parameters of several experiments.
     """
 
     trace: Trace
@@ -93,6 +98,7 @@ class Plan:
     data: str = ""
     rows: int | None = None
     labels: tuple[tuple[str, str], ...] = ()
+    declared: Trace | None = None
 
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """The parts of the plan, as `print` shows them.
@@ -102,19 +108,22 @@ class Plan:
         list of (str, list of (str, str))
             Of each part its title, and its rows: what, and how.
         """
-        t = self.trace
+        t = self.declared or self.trace
+        several = len(self.trace.experiments)
+        each = f"of each of the {several} experiments" if several else "of each experiment"
         first = {n: s for n, s in t.initial.items() if n not in t.auxiliary}
         out = [
-            ("Priors", _laws(t.parameters)),
+            ("Priors", _laws(t.parameters, dict.fromkeys(self.trace.per_experiment, each))),
             ("Initial distribution, t = 1", _laws(first)),
-            ("Transition, x_prev to x", _laws(t.transition, t.auxiliary)),
+            ("Transition, x_prev to x", _laws(t.transition, dict.fromkeys(t.auxiliary, AUXILIARY))),
             ("Observation", _laws(t.observations)),
         ]
         if loops := _loops(t):
             out.append(("Numerical integration", loops))
-        if t.inputs:
+        t = self.trace
+        if t.given_inputs:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
-                                   for n, s in t.inputs.items()]))  # fmt: skip
+                                   for n, s in t.given_inputs.items()]))  # fmt: skip
         if self.data:
             out.append(("Data", [("data set", self.data), *self.labels]))
         out.append(("Structure", self._structure()))
@@ -248,12 +257,12 @@ def _integrated(split: ConditionallyLinear) -> str:
     )
 
 
-def _laws(sites: dict[str, Site], auxiliary: Collection[str] = ()) -> list[tuple[str, str]]:
+def _laws(sites: dict[str, Site], told: Mapping[str, str] | None = None) -> list[tuple[str, str]]:
     rows = []
     for s in sites.values():
         rows.append((s.name, _cut(f"~ {s.distribution!r}")))
-        if s.name in auxiliary:
-            rows.append(("", "auxiliary variable of the transition, undefined at t = 1"))
+        if told and s.name in told:
+            rows.append(("", told[s.name]))
         if s.distribution.approximation:
             rows.append(("", s.distribution.approximation))
     return rows
@@ -324,7 +333,7 @@ def explain(model: Model, data: Any = None) -> Plan:
     ------
     ModelError, DataError : what is wrong, where, and the fix.
     """
-    traced = trace(model)
+    traced = trace_over(model, data)
     missing, bound, rows = Missing(none=True), "", None
     labels: tuple[tuple[str, str], ...] = ()
     if data is not None:
@@ -351,6 +360,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         bound,
         rows,
         labels,
+        trace(model),
     )
 
 
@@ -400,6 +410,6 @@ def compile(model: Model, data: Any = None) -> Program:
     ------
     ModelError, DataError : what is wrong, where, and the fix.
     """
-    traced = trace(model)
+    traced = trace_over(model, data)
     missing = Missing(none=True) if data is None else missing_of(bind(traced, data))
     return compile_trace(traced, missing)

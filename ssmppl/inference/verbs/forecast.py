@@ -22,6 +22,7 @@ from ssmppl.data import (
 )
 from ssmppl.data.experiments import EXPERIMENT, TIMES, experiments_of
 from ssmppl.data.parameters import pack, pack_states
+from ssmppl.data.per_experiment import number_of, trace_of_results, trace_over
 from ssmppl.data.time_steps import lengths
 from ssmppl.data.times import label_text, spacing, trading_days
 from ssmppl.errors import ArgumentError, listing, warn
@@ -37,8 +38,7 @@ from ssmppl.inference.verbs.simulate import check_finite, check_samplers, feeds_
 from ssmppl.inference.verbs.smooth import smooth
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.trace import Trace
-from ssmppl.language.tracing import trace
+from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
@@ -106,9 +106,11 @@ def forecast(
             "proposal= and draws= are of a forecast at known parameters, which needs the data",
             fix="give data=, and values of the parameters in place of the posterior",
         )
-    traced = trace(model)
+    if data is None:
+        traced = trace_of_results(model, posterior_of(idata, KNOWN))
+    else:
+        traced = trace_over(model, data)
     check_samplers(traced)
-
     if data is None:
         labels, one = _sampled(traced, idata)
     else:
@@ -133,7 +135,7 @@ def _ahead(
     """The rows after those of one experiment."""
     if inputs is None and steps and _needs_times_only(traced):
         inputs = _times_after(past, steps)
-    future, steps, source = bind_inputs(traced, inputs, steps)
+    future, steps, source = bind_inputs(traced, inputs, steps, _number(traced, past.u))
     labels = source.time
     theta, paths, zone = past.theta, past.paths, past.zone
     rows = paths.shape[1]
@@ -258,7 +260,10 @@ def _sampled(traced: Trace, idata: Any) -> Continued:
             )
         paths = all_draws(paths)
         rows = paths.shape[1]
-        given = _past(idata, "constant_data", traced.inputs, i)
+        given = _past(idata, "constant_data", traced.given_inputs, i)
+        if traced.experiments:
+            number = number_of(traced, labels[i] if labels else traced.experiments[0])
+            given[EXPERIMENT_NUMBER] = np.full(rows, float(number))
         columns = [given[n].reshape(rows, -1) for n in traced.inputs]
         y = np.zeros((rows, len(traced.observation_symbols)))
         if feeds_back(traced):
@@ -306,9 +311,15 @@ def _at_known(
     return labels, one
 
 
+def _number(traced: Trace, u: np.ndarray) -> float:
+    """That of the experiment whose inputs (T, U) these are."""
+    names = [s.data[1] for s in traced.input_symbols]
+    return float(u[-1, names.index(EXPERIMENT_NUMBER)]) if EXPERIMENT_NUMBER in names else 0.0
+
+
 def _needs_times_only(traced: Trace) -> bool:
     """Whether the time step is the only input."""
-    return traced.time_step is not None and list(traced.inputs) == [traced.time_step[0]]
+    return traced.time_step is not None and list(traced.given_inputs) == [traced.time_step[0]]
 
 
 def _times_after(past: _Past, steps: int) -> dict[str, np.ndarray] | None:

@@ -148,8 +148,12 @@ def leave_future_out(
             fresh = not shape <= threshold  # NaN is none to trust
         if fresh:
             with noticed():  # of the rows before t a channel may have none
-                known = [_until(e, b[t]) for e, b in zip(experiments, together.before, strict=True)]
-                known = [rows for rows in known if rows is not None]
+                own = bool(problem.trace.experiments)
+                known = [
+                    _until(e, b[t])
+                    for e, b in zip(experiments, together.before, strict=True)
+                    if b[t] or own
+                ]
                 idata = sample(model, known, seed=_number(seeds, refits), **settings)
             posterior = posterior_of(idata)
             if posterior.attrs["interrupted"]:  # a part of its draws, where nobody asked for it
@@ -253,10 +257,12 @@ def _efficiency(posterior: Any) -> float:
     return min(1.0, least / total) if np.isfinite(least) else 1.0
 
 
-def _until(whole: Experiment, rows: int) -> dict[str, np.ndarray] | None:
-    """The first rows as `sample` takes them; None where there are none yet."""
+def _until(whole: Experiment, rows: int) -> dict[str, np.ndarray]:
+    """The first rows as `sample` takes them; of an experiment that has none yet, but parameters of
+    its own, the first one without what was measured."""
     if not rows:
-        return None
+        nothing = {n: np.full_like(v[:1], np.nan) for n, v in whole.observed.items()}
+        return nothing | {n: v[:1] for n, v in whole.inputs.items()}
     return {n: v[:rows] for n, v in (whole.observed | whole.inputs).items()}
 
 

@@ -14,6 +14,7 @@ from ssmppl.analysis.structure import noisy_start
 from ssmppl.arguments import checked
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, warn, written_as
+from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.batched.reckoning import reckon
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
@@ -43,10 +44,10 @@ from ssmppl.inference.preparation.exact_models import exact_kind
 from ssmppl.inference.preparation.exact_score import ExactScore
 from ssmppl.inference.preparation.method_choice import choose_maximiser, start_as_parameter
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
-from ssmppl.inference.preparation.space import free_components, space_of
+from ssmppl.inference.preparation.space import Space, free_components, space_of
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import model_attributes
-from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.model import Model
@@ -128,7 +129,7 @@ def maximize(
             f"{twice[0]!r} is given in start and in fixed", fix=f"leave {twice[0]!r} out of one"
         )
     root = seed_sequence(seed)
-    space = space_of(problem, fixed_values, near)
+    space, fixed_values, idle = _without_idle(problem, objective, fixed_values, near)
     if method is None:
         reckon("maximize", problem, space.theta, CLIMB, progress)
     setup = Maximization(problem, space, objective, fixed_values, near, root, executor, progress)
@@ -148,6 +149,7 @@ def maximize(
         "objective": objective,
         "settings": asdict(chosen) if chosen is not None else {},
         "fixed": dict(fixed or {}),
+        **({"only_in_priors": idle} if idle else {}),
         **ascent.report,
         "interrupted": ascent.interrupted,
         "seed": str(root.entropy),
@@ -170,6 +172,24 @@ def maximize(
         problem.trace, ascent.theta, covariance, value, ascent.iterates, fixed_values, attrs,
         ascent.figures,
     )  # fmt: skip
+
+
+def _without_idle(
+    problem: Problem, objective: str, fixed: Mapping[str, np.ndarray], near: Mapping[str, Any]
+) -> tuple[Space, dict[str, np.ndarray], list[str]]:
+    """Where a climb begins, and what it leaves as it is: parameters of priors that no other
+    distribution holds, which the likelihood says nothing about."""
+    trace, space = problem.trace, space_of(problem, dict(fixed), dict(near))
+    sites = (trace.initial, trace.transition, trace.observations)
+    read = symbols_of(e for group in sites for s in group.values()
+                      for e in s.distribution.expressions())  # fmt: skip
+    idle = [n for n, site in trace.parameters.items()
+            if n not in fixed and read.isdisjoint(site.components)]  # fmt: skip
+    if objective != "likelihood" or not idle:
+        return space, dict(fixed), []
+    values = unpack_parameters(trace, space.theta)
+    held = {**fixed, **{n: values[n] for n in idle}}
+    return space_of(problem, held, {n: v for n, v in near.items() if n not in idle}), held, idle
 
 
 def choose_method(setup: Maximization) -> tuple[Any, str]:

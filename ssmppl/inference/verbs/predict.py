@@ -24,6 +24,7 @@ from ssmppl.data import (
 )
 from ssmppl.data.experiments import experiments_of
 from ssmppl.data.parameters import pack, pack_states
+from ssmppl.data.per_experiment import trace_of_results, trace_over
 from ssmppl.errors import ArgumentError, ModelError, listing
 from ssmppl.inference.run.labels import Labels, check_names, model_attributes, observes
 from ssmppl.inference.run.prior import draw_prior
@@ -158,7 +159,7 @@ def predict(
     ------
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
     """
-    traced = trace(model)
+    traced = trace_over(model, data) if data is not None else trace(model)
     if not traced.observations:
         raise ModelError(
             f"model {traced.name!r} has no @observation function: there is nothing to predict",
@@ -172,6 +173,7 @@ def predict(
             "give what ssm.sample returns, or None to draw from the prior; data come third, "
             "ssm.predict(model, None, data)",
         )
+        traced = trace_of_results(model, posterior)
     if data is None and steps is None:
         raise ArgumentError(
             "neither data nor steps tell how many rows to predict",

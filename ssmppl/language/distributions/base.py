@@ -288,6 +288,12 @@ class Distribution:
         """The distribution of one element of an elementwise distribution."""
         return self.rebuilt({n: a[index] for n, a in self.parameters.items()})
 
+    def repeated(self, n: int) -> Distribution:
+        """n independent ones along a new first axis, of an elementwise distribution."""
+        whole = {k: np.broadcast_to(a.view(np.ndarray), (n, *a.shape))
+                 for k, a in self.parameters.items()}  # fmt: skip
+        return self.rebuilt(whole)
+
     # -- to be defined by each distribution
     def log_densities(self, value: ExprArray) -> ExprArray:
         """Log density on the support: of the distribution's shape, or () for a joint one."""

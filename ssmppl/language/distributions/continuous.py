@@ -338,6 +338,9 @@ class Flat(Distribution):
     def rebuilt(self, parameters):
         return self
 
+    def repeated(self, n):
+        return self._at_place(type(self)((n, *self.shape)))
+
     def log_densities(self, value):
         return self._full(0.0)
 

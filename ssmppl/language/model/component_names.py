@@ -6,13 +6,15 @@ results have them in place of `effect_dim_0` and 0, 1, 2, ...
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ssmppl.errors import Location, ModelError, listing
+
+Shapes = Mapping[str, tuple[int, ...]]
 
 # Dims that results have of their own.
 TAKEN = {
@@ -85,7 +87,17 @@ class ComponentNames:
             labels[d] = tuple(array.tolist())
         return cls(found, labels)
 
-    def check(self, shapes: Mapping[str, tuple[int, ...]], where: Location) -> None:
+    def with_axis(
+        self, names: Iterable[str], dim: str, labels: tuple[Any, ...], shapes: Shapes
+    ) -> ComponentNames:
+        """With `dim` before the axes of these quantities, which have it already in `shapes`."""
+        dims = dict(self.dims)
+        for n in names:
+            rest = tuple(f"{n}_dim_{k}" for k in range(1, len(shapes[n])))
+            dims[n] = (dim, *self.dims.get(n, rest))
+        return ComponentNames(dims, {**self.coords, dim: labels})
+
+    def check(self, shapes: Shapes, where: Location) -> None:
         """Hold them against the shapes of the model's quantities.
 
         Raises

@@ -12,7 +12,7 @@ import linecache
 import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import numpy as np
 
@@ -140,6 +140,7 @@ class Model:
             key: () if length is None else (int(length),) for key, length in pairs
         }
         self.functions: dict[str, list[Callable[..., Any]]] = {role: [] for role in ROLES}
+        self.per_experiment: set[Callable[..., Any]] = set()  # priors of each experiment's own
         self._executions: dict[Callable[..., Any], Execution] = {}  # in which each was declared
         self._outdated: dict[tuple[str, str], Callable[..., Any]] = {}  # by role and name
 
@@ -158,19 +159,42 @@ class Model:
             )
         return None if name is None else (name, unit)
 
-    def prior(self, function: Law = _MISSING) -> Law:
+    @overload
+    def prior(self, function: Law = ...) -> Law: ...
+    @overload
+    def prior(self, *, per: str) -> Callable[[Law], Law]: ...
+    def prior(self, function: Any = _MISSING, *, per: str | None = None) -> Any:
         """Declare priors of parameters.
 
         Parameters
         ----------
         function : returns their distributions by name; its arguments are parameters declared
             earlier.
+        per : "experiment", ``@model.prior(per="experiment")``: each experiment has values of its
+            own, independent given the parameters that the prior names (random effects, a partially
+            pooled panel; Gelman and Hill 2007, chapter 12). In all other functions the name is
+            the value of the experiment at hand; in results it has the dim `experiment`.
 
         Returns
         -------
         function : itself, so that the name stays what it was.
         """
-        return self._declare("prior", function)
+        if per is None:
+            return self._declare("prior", function)
+        if per != "experiment":
+            raise ModelError(
+                f"per={per!r}",
+                fix='write @model.prior(per="experiment") for parameters that each experiment has '
+                "for itself",
+                where=user_location(),
+            )
+
+        def declare(function: Law = _MISSING) -> Law:
+            if inspect.isfunction(function) or inspect.ismethod(function):
+                self.per_experiment.add(function)
+            return self._declare("prior", function)
+
+        return declare if function is _MISSING else declare(function)
 
     def initial(self, function: Law = _MISSING) -> Law:
         """Declare the distribution of x_1, the state at the first row of the data.
@@ -298,6 +322,7 @@ class Model:
             for old in list(functions):
                 if old in self._executions and outdated(role, old, self._executions[old]):
                     functions.remove(old)
+                    self.per_experiment.discard(old)
                     del self._executions[old]
                     self._outdated[role, old.__qualname__] = old
 
@@ -320,7 +345,8 @@ class Model:
         variable that one reads from outside gets another value."""
         functions = [f for role in ROLES for f in self.functions[role]]
         outer = digest_of_code(functions)
-        own = (self.name, tuple(self.inputs.items()), self.experiment, self.component_names)
+        each = tuple(f in self.per_experiment for f in self.functions["prior"])
+        own = (self.name, tuple(self.inputs.items()), self.experiment, self.component_names, each)
         return (*own, *map(tuple, self.functions.values()), outer)
 
     def __repr__(self) -> str:

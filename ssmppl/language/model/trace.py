@@ -35,6 +35,8 @@ from ssmppl.language.distributions import Distribution
 from ssmppl.language.model.component_names import ComponentNames
 from ssmppl.language.model.pickling import UnpackedCache, digest_of, packed, unpacked
 
+EXPERIMENT_NUMBER = "experiment_number"
+
 
 @dataclass(frozen=True)
 class Site:
@@ -71,6 +73,10 @@ class Trace:
     time_step : the input that is the time to the next row, and its unit where times are dates.
     experiment : the column of long tables that tells experiments apart.
     component_names : of vectors and matrices, in results.
+    per_experiment : names of the parameters of which each experiment has its own.
+    experiments : labels of the experiments that these have values for, along their first axis; ()
+        where there is a single one, and then they are parameters as others. The input
+        `EXPERIMENT_NUMBER`, from 0, tells which one a row is of.
     """
 
     name: str
@@ -87,6 +93,8 @@ class Trace:
     time_step: tuple[str, str] | None = None
     experiment: str | None = None
     component_names: ComponentNames = field(default_factory=ComponentNames)
+    per_experiment: tuple[str, ...] = ()
+    experiments: tuple[Any, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Packed once, and one object in each process that gets it: what was generated for it is
@@ -126,6 +134,11 @@ class Trace:
     @cached_property
     def observation_symbols(self) -> list[Expr]:
         return [s for site in self.observations.values() for s in site.components]
+
+    @property
+    def given_inputs(self) -> dict[str, tuple[int, ...]]:
+        """The inputs that the user gives."""
+        return {n: shape for n, shape in self.inputs.items() if n != EXPERIMENT_NUMBER}
 
     @cached_property
     def input_symbols(self) -> list[Expr]:
