@@ -3,6 +3,7 @@
 import re
 
 import pytest
+import yaml
 
 import ssmppl
 from tests.packaging.environments import PYTHONS, SETS
@@ -27,6 +28,28 @@ def test_one_version():
     assert headings[0] == "Unreleased"
     assert all(re.fullmatch(r"\d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\)", one) for one in headings[1:])
     assert not headings[1:] or headings[1].split()[0] == VERSION
+
+
+CONDA_NAMES = {"matplotlib": "matplotlib-base"}  # without the windows of a desktop
+
+
+def test_the_conda_recipe_asks_for_the_same():
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text(encoding="utf-8"))
+    assert recipe["context"]["version"] == VERSION
+    project = PROJECT["project"]
+    least = recipe["context"]["python_min"]
+    run = [r.replace("${{ python_min }}", least).split() for r in recipe["requirements"]["run"]]
+    asked = [re.match(r"([\w-]+)(.*)", d).groups() for d in project["dependencies"]]
+    assert run == [
+        ["python", project["requires-python"]],
+        *([CONDA_NAMES.get(n, n), bounds] for n, bounds in asked),
+    ]
+    (build,) = PROJECT["build-system"]["requires"]
+    assert recipe["requirements"]["host"][-1].replace(" ", "") == build
+    (script,) = project["scripts"].items()
+    assert recipe["build"]["python"]["entry_points"] == [" = ".join(script)]
+    about = recipe["about"]
+    assert (about["summary"], about["license"]) == (project["description"], project["license"])
 
 
 def test_the_wheel_takes_all_that_is_in_the_folder():
