@@ -49,6 +49,7 @@ from ssmppl.inference.verbs.score import score
 from ssmppl.inference.verbs.simulate import simulate
 from ssmppl.inference.verbs.smooth import smooth
 from ssmppl.language.distributions import (
+    LKJ,
     Bernoulli,
     Beta,
     BetaBinomial,
@@ -71,6 +72,7 @@ from ssmppl.language.distributions import (
     MvNormal,
     NegativeBinomial,
     Normal,
+    Ordered,
     Poisson,
     StudentT,
     Truncated,
@@ -161,6 +163,7 @@ __all__ = [
     "InverseGamma",
     "InverseWishart",
     "KalmanSmoother",
+    "LKJ",
     "Laplace",
     "LogNormal",
     "MetropolisHastings",
@@ -170,6 +173,7 @@ __all__ = [
     "MvNormal",
     "NegativeBinomial",
     "Normal",
+    "Ordered",
     "ParticleEM",
     "Poisson",
     "SSMError",

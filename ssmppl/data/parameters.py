@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.data.values import Fault, as_numbers, asymmetry, number, outside, short
+from ssmppl.data.values import Fault, as_numbers, asymmetry, number, outside, short, without_unit_diagonal
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model.trace import Site, Trace
@@ -107,9 +107,11 @@ def _value(site: Site, value: Any, argument: str) -> np.ndarray:
             f"{argument}: parameter {site.name!r}{_index(index)} is {number(array[index])}",
             fix="give a finite number",
         )
-    # of an asymmetric matrix a likelihood would read one half only
-    cone = site.distribution.support().kind == "positive definite"
-    if cone and (fault := asymmetry(array)) is not None:
+    # a likelihood reads one half of a symmetric matrix only, and no diagonal of ones
+    law = site.distribution
+    fault = asymmetry(array) if law.symmetric else None
+    fault = fault or (without_unit_diagonal(array) if law.unit_diagonal else None)
+    if fault is not None:
         raise ArgumentError(
             f"{argument}: parameter {site.name!r}{_index((fault.index or ())[1:])}: {fault.found}",
             fix=f"give {fault.fix}",

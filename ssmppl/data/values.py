@@ -17,6 +17,7 @@ from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.distributions import Distribution, Truncated
 from ssmppl.language.distributions.base import Support
 
+UNIT_ROUNDING = 1e-8  # by which a diagonal of ones may miss 1
 Values = Mapping[Expr, np.ndarray]
 
 
@@ -181,7 +182,9 @@ def outside(
         return _outside_simplex(distribution, values)
     if support.kind == "positive definite":
         return _outside_cone(distribution, values)
-    if support.kind not in ("interval", "integers"):
+    if support.kind == "correlation":
+        return _outside_unit_diagonal(values) or _outside_cone(distribution, values)
+    if support.kind not in ("interval", "integers", "ordered"):
         return None
     lower = _bound(support.lower, env, len(values), -math.inf)
     upper = _bound(support.upper, env, len(values), math.inf)
@@ -193,7 +196,7 @@ def outside(
         if support.kind == "integers":
             bad |= np.isfinite(values) & (values != np.floor(values))
     if not bad.any():
-        return None
+        return _out_of_order(values) if support.kind == "ordered" else None
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     low, high = lower[index], upper[index]
     if support.kind == "integers":
@@ -207,7 +210,7 @@ def outside(
     return Fault(
         index,
         f"{number(values[index])} is outside the support of {name_of(distribution)}, {bounds}",
-        f"a value in {bounds}" if support.kind == "interval" else f"one of {bounds}",
+        f"one of {bounds}" if support.kind == "integers" else f"a value in {bounds}",
     )
 
 
@@ -247,6 +250,38 @@ def _outside_simplex(distribution: Distribution, values: np.ndarray) -> Fault | 
             return Fault(index, f"the shares {p.tolist()} sum to {number(p.sum())}, not to 1",
                          "shares divided by their sum")  # fmt: skip
     return None
+
+
+def _out_of_order(values: np.ndarray) -> Fault | None:
+    with np.errstate(invalid="ignore"):
+        bad = values[..., 1:] <= values[..., :-1]
+    if not bad.any():
+        return None
+    *row, k = (int(i) for i in np.argwhere(bad)[0])
+    before, after = values[(*row, k)], values[(*row, k + 1)]
+    return Fault(
+        (*row, k + 1),
+        f"{number(after)} does not lie above the component before it, {number(before)}",
+        "values in increasing order",
+    )
+
+
+def without_unit_diagonal(m: np.ndarray, row: int = 0) -> Fault | None:
+    """What keeps a matrix, at this row of the data, from having a diagonal of ones."""
+    off = np.abs(np.diagonal(m) - 1.0)
+    if not (off > UNIT_ROUNDING).any():
+        return None
+    i = int(np.argmax(off))
+    return Fault(
+        (row, i, i),
+        f"the diagonal of a correlation matrix is 1, entry [{i}, {i}] is {number(m[i, i])}",
+        "the correlations: of a covariance C, C / np.sqrt(np.outer(np.diag(C), np.diag(C)))",
+    )
+
+
+def _outside_unit_diagonal(values: np.ndarray) -> Fault | None:
+    faults = (without_unit_diagonal(m, row) for row, m in enumerate(values) if np.isfinite(m).all())
+    return next(filter(None, faults), None)
 
 
 def asymmetry(m: np.ndarray, row: int = 0) -> Fault | None:

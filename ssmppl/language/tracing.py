@@ -32,6 +32,7 @@ from ssmppl.language.checks.rules import (
     check_states,
 )
 from ssmppl.language.distributions.base import Distribution
+from ssmppl.language.distributions.multivariate import with_unit_diagonal
 from ssmppl.language.model.calling import call, call_once, check_outer_names, return_location
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
@@ -107,6 +108,7 @@ class _Tracer:
         self.known: dict[str, tuple[str, tuple[int, ...]]] = {}  # name -> (role, shape)
         self.owner: dict[str, Location] = {}
         self.symmetric: set[str] = set()  # parameters that are symmetric matrices
+        self.correlations: set[str] = set()  # and those of unit diagonal
         self.defaults: list[tuple[str, str, Callable[..., Any]]] = []  # taken: argument, role
         self.new = NewValues()
 
@@ -202,6 +204,8 @@ class _Tracer:
                     self._claim(name, DRAW if fresh else role, distribution.shape, line)
                     if distribution.symmetric:
                         self.symmetric.add(name)
+                    if distribution.unit_diagonal:
+                        self.correlations.add(name)
                 value = symbols(role, name, distribution.shape, name in self.symmetric)
                 sites[name] = Site(name, role, distribution, value, where)
                 givers[name] = function
@@ -325,6 +329,7 @@ class _Tracer:
         known_as, shape = self.known[name]
         kind = self._allowed(role)[known_as]
         value = symbols(kind, name, shape, name in self.symmetric)
+        value = with_unit_diagonal(value) if name in self.correlations else value
         if name in self.each and self.experiments:
             value = self._of_this(value, role)
         return value[()] if value.shape == () else value

@@ -201,6 +201,7 @@ def _slice(
         "real": "slice sampling of the full conditional",
         "simplex": "slice sampling of the full conditional of its log ratios",
         "matrix": "slice sampling of the full conditional of its Cholesky factor (log diagonal)",
+        "correlation": "slice sampling of the full conditional of its partial correlations (atanh)",
     }[kind]
     cost = "each density evaluation costs one pass over the data"
     law = f"{how}, evaluated from sufficient statistics" if form else f"{how}; {cost}"

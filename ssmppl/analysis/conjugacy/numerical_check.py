@@ -219,10 +219,13 @@ def _fill(
             draws = rng.dirichlet(np.full(len(row), 3.0), POINTS).T
             values.update(zip(row, draws, strict=True))
         return
-    if support.kind == "positive definite":
+    if support.kind in ("positive definite", "correlation"):
         p = site.shape[0]
         a = rng.standard_normal((POINTS, p, p))
         m = 0.3 * a @ a.transpose(0, 2, 1) + np.eye(p) * rng.uniform(0.7, 1.5, (POINTS, 1, 1))
+        if support.kind == "correlation":
+            scale = np.sqrt(np.diagonal(m, axis1=1, axis2=2))
+            m = m / (scale[:, :, None] * scale[:, None, :])
         half = lower_half(p)
         values.update((c, m[:, i, j]) for c, (i, j) in zip(components, half, strict=True))
         return
@@ -238,6 +241,9 @@ def _fill(
             drawn = _edged(drawn, low, high, rng)
             drawn = np.where(np.isfinite(low) | np.isfinite(high), drawn, spread * drawn)
         values[c] = drawn
+    if support.kind == "ordered":
+        for row in site.value.reshape(-1, site.shape[-1]).view(np.ndarray):
+            values.update(zip(row, np.sort([values[c] for c in row], axis=0), strict=True))
 
 
 def _interval(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -274,6 +280,7 @@ def _integers(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> np
 _MAKERS: dict[str, Callable[..., np.ndarray]] = {
     "real": _interval,
     "interval": _interval,
+    "ordered": _interval,
     "integers": _integers,
     "point": lambda low, high, rng: low,
 }

@@ -56,7 +56,7 @@ class Search:
             kind = block_kind(site)
             if kind == "simplex":  # a vector, or each row of a matrix
                 out += [tuple(row) for row in site.value.reshape(-1, site.shape[-1])]
-            elif kind == "matrix":
+            elif kind in ("matrix", "correlation"):
                 out.append(tuple(site.components))
             else:
                 out += [(c,) for c in site.components]
@@ -292,17 +292,25 @@ def connected(
 
 def block_kind(site: Site) -> str:
     support = site.distribution.support().kind
-    return {"simplex": "simplex", "positive definite": "matrix"}.get(support, "real")
+    kinds = {
+        "simplex": "simplex", "positive definite": "matrix", "correlation": "correlation"
+    }  # fmt: skip
+    return kinds.get(support, "real")
 
 
 def bounds_of(site: Site) -> dict[Expr, tuple[Expr, Expr]]:
-    """(lower, upper) of each component from its own prior."""
+    """(lower, upper) of each component from its own prior; of ordered ones, their neighbours."""
     support = site.distribution.support()
     infinite = (constant(-np.inf), constant(np.inf))
-    if support.kind != "interval":
+    if support.kind not in ("interval", "ordered"):
         return dict.fromkeys(site.components, infinite)
     lower = np.broadcast_to(support.lower.view(np.ndarray), site.shape).ravel()
     upper = np.broadcast_to(support.upper.view(np.ndarray), site.shape).ravel()
+    if support.kind == "ordered":
+        rows = np.array(site.value.view(np.ndarray).reshape(-1, site.shape[-1]))
+        lower, upper = lower.reshape(rows.shape).copy(), upper.reshape(rows.shape).copy()
+        lower[:, 1:], upper[:, :-1] = rows[:, :-1], rows[:, 1:]
+        lower, upper = lower.ravel(), upper.ravel()
     return {
         value: (low, high)
         for value, low, high in zip(site.value.ravel(), lower, upper, strict=True)

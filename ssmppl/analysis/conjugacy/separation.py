@@ -31,7 +31,7 @@ from ssmppl.language.model.trace import Site, Trace
 
 ROLES = ("prior", "initial", "transition", "observation")
 BOUNDED_ROLES = ("prior", "initial")  # as many terms, however long the series
-_BOUNDED = ("interval", "integers")
+_BOUNDED = ("interval", "integers", "ordered")
 
 
 @dataclass(frozen=True)

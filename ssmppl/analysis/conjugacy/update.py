@@ -43,7 +43,7 @@ class Update:
     where: Location | None = None
     needs_log_joint: bool = False
     inseparable_terms: tuple[JointTerm, ...] = ()
-    kind: str = "real"  # or "simplex", "matrix"
+    kind: str = "real"  # or "simplex", "matrix", "correlation"
     family: Family | None = field(default=None, repr=False)
 
 

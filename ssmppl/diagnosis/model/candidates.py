@@ -252,9 +252,9 @@ def _unused(part: Part, equations: Equations) -> str:
     """Why an input or a parameter cannot be changed over time."""
     trace = equations.trace
     if part.role == "parameter":
-        kind = trace.parameters[part.name].distribution.support().kind
-        if kind in ("simplex", "positive definite"):
-            return f"its components are bound to each other ({kind})"
+        support = trace.parameters[part.name].distribution.support()
+        if support.tied:
+            return f"its components are bound to each other ({support.kind})"
     laws = [*trace.transition.values(), *trace.observations.values()]
     inside = symbols_of(
         [e for s in laws for a in s.distribution.parameters.values() for e in array(a).ravel()]

@@ -181,11 +181,10 @@ def _reach(space: Space) -> dict[Expr, Interval]:
 
 
 def _check(site: Site, kind: str, reach: Mapping[Expr, Interval]) -> None:
-    support = site.distribution.support().kind
-    if support in ("simplex", "positive definite"):
+    tied = site.distribution.support().tied
+    if tied:
         raise ArgumentError(
-            f"{site.name} is a {support.replace('simplex', 'probability vector')}"
-            f"{' matrix' if support != 'simplex' else ''}: it cannot move on the {kind} scale",
+            f"{site.name} is {tied}: it cannot move on the {kind} scale",
             fix=f'add transform={{"{site.name}": "unconstrained"}}',
             where=site.distribution.location,
         )

@@ -36,6 +36,7 @@ AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb
 FALL = 0.5  # of the objective inwards: half a unit, as at one standard error of a normal law
 FLAT = 1e-2  # information in z below which an edge may be near: a standard error of 10
 INSIDE = 1e-12  # what takes the place of a share of exactly zero
+WITHIN_ONE = 1e-8  # by which correlations of -1 and 1 are shrunk: steps outwards still change them
 
 
 def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.ndarray:
@@ -114,7 +115,9 @@ def _reached(
     """(component, edge) of one parameter; what is not identified beside it is no longer kept, and
     what has no edge there is."""
     support = t.site.distribution.support()
-    if support.kind == "positive definite":
+    if support.kind == "correlation":
+        return _singular(t, found, kept)
+    if support.tied and support.kind != "simplex":
         kept[:] = True
         return []
     if support.kind == "simplex":
@@ -145,6 +148,21 @@ def _reached(
     return out
 
 
+def _singular(t: Transform, found: np.ndarray, kept: np.ndarray) -> list[tuple[int, float]]:
+    """Of a correlation matrix: the correlations with its first row, which alone have an edge of
+    their own, -1 or 1; beside it the others of their row are not identified."""
+    place = {s.data[2]: k for k, s in enumerate(t.components)}
+    out, at = [], 0
+    for i in range(1, t.site.shape[0]):
+        if found[at] != 0.0:
+            out.append((place[i, 0], float(found[at])))
+            kept[at + 1 : at + i] = False
+        else:
+            kept[at : at + i] = True
+        at += i
+    return out
+
+
 def _ends(site: Site, known: dict[Expr, float]) -> np.ndarray:
     """(components, 2) bounds of a site of numbers."""
     support = site.distribution.support()
@@ -162,12 +180,16 @@ def _edge(lower: float, upper: float, sign: float) -> float:
 
 
 def _inside(setup: Maximization, theta: np.ndarray) -> np.ndarray:
-    """(F,) the place of theta; of shares of zero, of shares next to it."""
+    """(F,) the place of theta; of shares of zero, of shares next to it, and of correlations of 1
+    likewise."""
     trace, values = setup.problem.trace, {}
     for name, value in unpack_parameters(trace, theta).items():
         value = np.asarray(value, dtype=float)
-        if trace.parameters[name].distribution.support().kind == "simplex":
+        kind = trace.parameters[name].distribution.support().kind
+        if kind == "simplex":
             value = np.maximum(value, INSIDE)
             value = value / value.sum(axis=-1, keepdims=True)
+        if kind == "correlation":
+            value = (1.0 - WITHIN_ONE) * value + WITHIN_ONE * np.eye(len(value))
         values[name] = value
     return unconstrain(trace, theta, values)[setup.space.positions]

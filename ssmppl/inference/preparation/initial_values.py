@@ -109,11 +109,13 @@ def _moderate(site: Site, known: dict[Expr, float]) -> np.ndarray:
     d = site.distribution
     mean = np.broadcast_to(evaluate(array(d.mean()), known), site.shape).astype(float)
     support = d.support()
-    if support.kind == "positive definite":
+    if support.kind in ("positive definite", "correlation"):
         usable = bool(np.all(np.isfinite(mean))) and bool(np.all(np.linalg.eigvalsh(mean) > 0))
         return mean if usable else np.eye(site.shape[0])
     lower = np.broadcast_to(evaluate(array(support.lower), known), site.shape)
     upper = np.broadcast_to(evaluate(array(support.upper), known), site.shape)
+    if support.kind == "ordered":
+        return _in_order(d, lower, upper, known)
     half_way = np.array([_between(a, b) for a, b in zip(lower.flat, upper.flat, strict=True)])
     half_way = half_way.reshape(site.shape)
     for centre, spread in _centres(d, mean, known):
@@ -121,6 +123,24 @@ def _moderate(site: Site, known: dict[Expr, float]) -> np.ndarray:
         inside = np.isfinite(centre) & (centre > lower) & (centre < upper) & tells
         half_way = np.where(inside, centre, half_way)
     return half_way
+
+
+def _in_order(
+    d: Distribution, lower: np.ndarray, upper: np.ndarray, known: dict[Expr, float]
+) -> np.ndarray:
+    """Increasing values: quantiles at equal steps of probability, else at equal distances."""
+    k = lower.shape[-1]
+    (law,) = d.inside()
+    steps = np.broadcast_to(np.arange(1.0, k + 1.0) / (k + 1.0), lower.shape)
+    with np.errstate(all="ignore"), contextlib.suppress(AttributeError, SSMError):
+        found = np.broadcast_to(evaluate(law.quantile(array(steps)), known), lower.shape)
+        inside = np.isfinite(found) & (found > lower) & (found < upper)
+        if np.all(inside) and np.all(np.diff(found) > 0.0):
+            return found.astype(float)
+    first = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - k - 1.0, 0.0))
+    both = np.isfinite(lower) & np.isfinite(upper)
+    with np.errstate(invalid="ignore"):
+        return first + np.where(both, upper - lower, k + 1.0) * steps
 
 
 def _centres(

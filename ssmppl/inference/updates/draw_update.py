@@ -41,6 +41,7 @@ from ssmppl.expressions.expr import Expr, symbols_of, to_text
 from ssmppl.inference.updates.slices import (
     Density,
     comparable,
+    sweep_correlations,
     sweep_matrix,
     sweep_real,
     sweep_simplex,
@@ -218,6 +219,8 @@ class UpdateSampler:
             raise self._impossible(values, log_joint)
         if update.kind == "simplex":
             new = sweep_simplex(at, values, rng)
+        elif update.kind == "correlation":
+            new = sweep_correlations(at, values, size_of_matrix(len(values)), rng)
         elif p := self.matrix_size:  # the numbers given the matrix, then the matrix
             n = len(values) - p * (p + 1) // 2
             matrix = values[n:]

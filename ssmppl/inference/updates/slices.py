@@ -6,7 +6,8 @@ the step leaves the conditional exactly invariant whatever the width.
 
 Coordinates: a number with one bound by the log of its distance from it; on an interval as it is,
 with the interval as the first slice; a simplex by log ratios to its last entry; a positive
-definite matrix by its Cholesky factor with the log of the diagonal. Their Jacobians are included.
+definite matrix by its Cholesky factor with the log of the diagonal; a correlation matrix by the
+inverse hyperbolic tangents of partial correlations. Their Jacobians are included.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ssmppl.analysis.conjugacy.matrix_families import lower_half, symmetric
+from ssmppl.language.model.transforms import free_correlations
 
 Density = Callable[[Sequence[float]], float]
 _DOUBLINGS = 60
@@ -186,6 +188,42 @@ def sweep_matrix(
     root = np.linalg.cholesky(symmetric(values, size))
     start = [math.log(root[c]) if c[0] == c[1] else float(root[c]) for c in cells]
     value, _ = matrix(sweep_real(at, start, [(-math.inf, math.inf)] * len(cells), rng))
+    return [value[c] for c in cells]
+
+
+def sweep_correlations(
+    log_density: Density, values: Sequence[float], size: int, rng: np.random.Generator
+) -> list[float]:
+    """Slice steps over partial correlations tanh z, those of row i given the columns before j.
+
+    dR = prod_ij cosh(z_ij)^-(p - j) dz (j from 0): Lewandowski, Kurowicka and Joe (2009).
+    """
+    cells = lower_half(size)
+
+    def matrix(z: Sequence[float]) -> tuple[np.ndarray, float]:
+        root, log_jacobian, given = np.zeros((size, size)), 0.0, iter(z)
+        for i in range(size):
+            left = 1.0
+            for j in range(i):
+                s = next(given)
+                root[i, j] = left * math.tanh(s)
+                log_cosh = float(np.logaddexp(s, -s)) - math.log(2.0)
+                left *= math.exp(-log_cosh)
+                log_jacobian -= (size - j) * log_cosh
+            root[i, i] = left
+        value = root @ root.T
+        np.fill_diagonal(value, 1.0)
+        kept = _kept(value, np.diagonal(root))
+        return value, log_jacobian if kept else -math.inf
+
+    def at(z: Sequence[float]) -> float:
+        value, log_jacobian = matrix(z)
+        if log_jacobian == -math.inf:
+            return -math.inf
+        return log_density([value[c] for c in cells]) + log_jacobian
+
+    start = free_correlations(symmetric(values, size)).tolist()
+    value, _ = matrix(sweep_real(at, start, [(-math.inf, math.inf)] * len(start), rng))
     return [value[c] for c in cells]
 
 

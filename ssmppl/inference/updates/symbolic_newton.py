@@ -34,7 +34,7 @@ SMALL_STEP = 1e-12
 class Unconstrained:
     """theta -> the unconstrained numbers z of some of its components, compiled.
 
-    Of a simplex or a matrix all components are members. z, transforms : in the trace's order.
+    Of a simplex, a matrix or an ordered vector all components are members. z, transforms : in the trace's order.
     """
 
     def __init__(self, trace: Trace, components: Sequence[Expr]):
@@ -57,7 +57,7 @@ class Unconstrained:
     def _inverse(self, t: Transform) -> Callable[[list[float]], Sequence[float]]:
         """The members of one parameter."""
         support, symbols = t.site.distribution.support(), self.trace.parameter_symbols
-        if support.kind in ("simplex", "positive definite"):
+        if support.tied:
             return partial(_whole, t, symbols)
         lower, upper = (array(b).ravel() for b in (support.lower, support.upper))
         limits = zip(t.components, lower, upper, strict=True)
@@ -197,7 +197,7 @@ def _free(value: Expr, lower: Expr, upper: Expr) -> Expr:
 
 
 def _whole(t: Transform, symbols: Sequence[Expr], theta: list[float]) -> list[float]:
-    """The unconstrained numbers of a simplex or a matrix."""
+    """The unconstrained numbers of a parameter whose components are tied, as those of a simplex."""
     known = dict(zip(symbols, theta, strict=True))
     value = np.array([known[s] for s in t.site.value.ravel()]).reshape(t.site.shape)
     return t.inverse(value, known).tolist()

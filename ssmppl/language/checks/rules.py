@@ -116,6 +116,12 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
             fix="make it a state with a Dirac transition, or compare models",
             where=where,
         )
+    if role != "prior" and distribution.prior_only:
+        raise ModelError(
+            f"the distribution of {name!r} is {kind}, a prior of parameters only",
+            fix=f"declare it in @prior, and name {name!r} as an argument where its value acts",
+            where=where,
+        )
     allowed = role == "prior" or (role == "initial" and kind == "Flat")
     if not distribution.proper and not allowed:
         raise ModelError(

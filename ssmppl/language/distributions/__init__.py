@@ -20,7 +20,14 @@ from ssmppl.language.distributions.discrete import (
 )
 from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
-from ssmppl.language.distributions.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
+from ssmppl.language.distributions.multivariate import (
+    LKJ,
+    Dirichlet,
+    InverseWishart,
+    MvNormal,
+    Ordered,
+    Wishart,
+)
 from ssmppl.language.distributions.positive import Beta, Exponential, Gamma, InverseGamma, Weibull
 from ssmppl.language.distributions.symmetric import (
     Cauchy,
@@ -36,7 +43,7 @@ DISTRIBUTIONS: dict[str, type[Distribution]] = {
     for cls in (
         Normal, MvNormal, LogNormal, StudentT, Laplace, Cauchy, HalfNormal, HalfCauchy, Uniform,
         Exponential, Weibull, Gamma, InverseGamma, Beta, VonMises, Dirichlet, Wishart,
-        InverseWishart, Poisson, NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical,
+        InverseWishart, LKJ, Ordered, Poisson, NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical,
         Dirac, Truncated, Mixture, ZeroInflated, Flat, HalfFlat,
     )
 }  # fmt: skip

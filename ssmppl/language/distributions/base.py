@@ -30,6 +30,10 @@ LOG_2 = math.log(2.0)
 LOG_2PI = math.log(2.0 * math.pi)
 ROUNDING = 1e-9
 REPEATED = 4  # equal entries in a row from which they are said once
+TIED = {
+    "simplex": "a probability vector", "positive definite": "a positive definite matrix",
+    "correlation": "a correlation matrix", "ordered": "in increasing order",
+}  # fmt: skip
 WIDEST = 30  # characters of an argument that is written again in a fix
 
 
@@ -38,13 +42,20 @@ class Support:
     """Where a distribution lives.
 
     kind : "real", "interval" (between lower and upper), "integers" (likewise), "simplex",
-        "positive definite", or "point" (Dirac).
+        "positive definite", "correlation" (such matrices of unit diagonal), "ordered" (increasing
+        along the last axis, between lower and upper), or "point" (Dirac).
     lower, upper : bounds, of the distribution's shape; infinite where there is none.
     """
 
     kind: str
     lower: ExprArray
     upper: ExprArray
+
+    @property
+    def tied(self) -> str:
+        """What the components are together where no one of them moves freely within numbers; empty
+        where each does."""
+        return TIED.get(self.kind, "")
 
 
 @dataclass(frozen=True)
@@ -135,11 +146,13 @@ class Distribution:
     drawable = True  # whether it has a sampler
     guards_range = False  # whether its density has to know where a parameter is out of range
     symmetric = False  # whether values are symmetric matrices, whose two halves share symbols
+    unit_diagonal = False  # whether they have a diagonal of ones
     by_name = "spread"  # what the keyword-only arguments are called in messages
     trials = ""  # the parameter that is a number of trials
     approximation = ""  # what it stands for and how, where it is no exact law of that
     # What analyses make use of where it is known.
     truncatable = True  # whether `Truncated` takes it
+    prior_only = False  # whether it is one of parameters alone
     gaussian_noise = False  # whether draws are made of normal ones alone; then it has `standard`
     maximisers: ClassVar[Mapping[str, Maximiser]] = {}  # by parameter, the others given
     highest: float | None = None  # what no log density is above, 0 of probabilities

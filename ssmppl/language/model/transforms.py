@@ -2,7 +2,8 @@
 
 Numbers: identity, log, or logit between bounds (which may depend on earlier parameters).
 Probability vectors: stick breaking. Positive definite matrices: the Cholesky factor with the log of
-its diagonal. Stan Development Team (2024), "Stan reference manual", section "Constraint
+its diagonal. Correlation matrices: the inverse hyperbolic tangents of partial correlations.
+Increasing vectors: the logarithms of the gaps, or between two bounds, where a stick is broken. Stan Development Team (2024), "Stan reference manual", section "Constraint
 transforms", gives the Jacobians.
 """
 
@@ -14,9 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.expressions.arrays import array
+from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
+from ssmppl.language.distributions.multivariate import with_unit_diagonal
 from ssmppl.language.distributions.positive import LEAST_SHARE
 from ssmppl.language.model.trace import Site, Trace
 
@@ -50,6 +52,8 @@ class Transform:
     def inverse(self, value: np.ndarray, known: dict[Expr, float]) -> np.ndarray:
         """The unconstrained numbers of a value (the site's shape), numerically."""
         support = self.site.distribution.support()
+        if support.kind == "correlation":
+            return free_correlations(value)
         if support.kind == "simplex":
             return np.concatenate([_unstick(row) for row in value.reshape(-1, value.shape[-1])])
         if support.kind == "positive definite":
@@ -58,6 +62,11 @@ class Transform:
             return np.array(out)
         lower = np.broadcast_to(evaluate(array(support.lower), known), value.shape).ravel()
         upper = np.broadcast_to(evaluate(array(support.upper), known), value.shape).ravel()
+        if support.kind == "ordered":
+            k, out = value.shape[-1], []
+            for first in range(0, value.size, k):  # of each row
+                out.append(_free_gaps(value.ravel()[first : first + k], lower[first], upper[first]))
+            return np.concatenate(out)
         pairs = zip(value.ravel(), lower, upper, strict=True)
         return np.array([free_number(v, a, b) for v, a, b in pairs])
 
@@ -108,6 +117,18 @@ def _transform(site: Site) -> Transform:
         p = site.shape[0]
         z = _free_symbols(site, p * (p + 1) // 2)
         values, log_jacobian = _cholesky(z, p, site)
+    elif support.kind == "correlation":
+        p = site.shape[0]
+        z = _free_symbols(site, p * (p - 1) // 2)
+        values, log_jacobian = _correlations(z, p, site)
+    elif support.kind == "ordered":
+        k = site.shape[-1]
+        z, values, log_jacobian = _free_symbols(site, len(components)), [], ZERO
+        ends = array(support.lower).ravel(), array(support.upper).ravel()
+        for first in range(0, len(z), k):  # of each row
+            row, part = _gaps(z[first : first + k], ends[0][first], ends[1][first])
+            values += row
+            log_jacobian = log_jacobian + part
     else:
         z = _free_symbols(site, len(components))
         lower, upper = array(support.lower).ravel(), array(support.upper).ravel()
@@ -188,18 +209,91 @@ def _cholesky(z: list[Expr], p: int, site: Site) -> tuple[list[Expr], Expr]:
         root[i, j] = apply("exp", s) if i == j else s
         if i == j:
             log_jacobian = log_jacobian + (p - i + 1.0) * s
-    matrix = array(root) @ array(root).T
+    return _distinct(array(root) @ array(root).T, site), log_jacobian
+
+
+def _distinct(matrix: ExprArray, site: Site) -> list[Expr]:
+    """The entries of a symmetric matrix in the order of the site's components."""
     place = {s: i for i, s in reversed(list(enumerate(site.value.ravel())))}
-    return [matrix.ravel()[place[s]] for s in site.components], log_jacobian
+    return [matrix.ravel()[place[s]] for s in site.components]
+
+
+def _correlations(z: list[Expr], p: int, site: Site) -> tuple[list[Expr], Expr]:
+    """tanh z are partial correlations: of a row and column, given the columns before it."""
+    root = np.full((p, p), ZERO, dtype=object)
+    root[0, 0], log_jacobian, given = constant(1.0), ZERO, iter(z)
+    for i in range(1, p):
+        left = constant(1.0)  # the root of what is left of the row's unit length
+        for j in range(i):
+            s = next(given)
+            root[i, j] = left * apply("tanh", s)
+            log_cosh = apply("logaddexp", s, -s) - math.log(2.0)
+            left = left * apply("exp", -log_cosh)
+            log_jacobian = log_jacobian - (p - j) * log_cosh
+        root[i, i] = left
+    return _distinct(with_unit_diagonal(array(root) @ array(root).T), site), log_jacobian
+
+
+def free_correlations(matrix: np.ndarray) -> np.ndarray:
+    """The unconstrained numbers of a correlation matrix; of one that is singular by rounding, those
+    of one next to it."""
+    root = np.linalg.cholesky(_regular(matrix))
+    left = np.sqrt(np.cumsum((root**2)[:, ::-1], axis=1)[:, ::-1])  # of a row from a column on
+    return np.array([
+        math.asinh(root[i, j] / left[i, j + 1]) for i in range(1, len(root)) for j in range(i)
+    ])  # fmt: skip
+
+
+def _regular(matrix: np.ndarray) -> np.ndarray:
+    """A correlation matrix shrunk towards the identity until it is positive definite."""
+    for shrunk in (0.0, *10.0 ** np.arange(-15.0, 0.0)):
+        found = (1.0 - shrunk) * matrix + shrunk * np.eye(len(matrix))
+        try:
+            if np.all(np.diagonal(np.linalg.cholesky(found)) > 0.0):
+                return found
+        except np.linalg.LinAlgError:
+            continue
+    return np.eye(len(matrix))
+
+
+def _gaps(z: list[Expr], lower: Expr, upper: Expr) -> tuple[list[Expr], Expr]:
+    """Numbers in increasing order: the one next to a bound, or the first of all, and the gaps."""
+    bounded = not _is(lower, -math.inf), not _is(upper, math.inf)
+    if all(bounded):
+        shares, log_jacobian = _stick(z)
+        width, values, below = upper - lower, list[Expr](), constant(0.0)
+        for share in shares[:-1]:
+            below = below + share
+            values.append(lower + width * below)
+        return values, log_jacobian + len(z) * apply("log", width)
+    sign, order = (-1.0, z[::-1]) if bounded[1] else (1.0, z)  # downwards from an upper bound
+    value, log_jacobian = _bounded(order[0], lower, upper)
+    values = [value]
+    for s in order[1:]:
+        values.append(values[-1] + sign * apply("exp", s))
+        log_jacobian = log_jacobian + s
+    return values[::-1] if bounded[1] else values, log_jacobian
+
+
+def _free_gaps(value: np.ndarray, lower: float, upper: float) -> np.ndarray:
+    gaps = np.diff(value)
+    if lower > -math.inf and upper < math.inf:
+        return _unstick(np.array([value[0] - lower, *gaps, upper - value[-1]]) / (upper - lower))
+    # two that are one by rounding are next to each other
+    least = np.maximum(np.spacing(np.abs(value[1:])), LEAST_SHARE)
+    logs = np.log(np.maximum(gaps, least))
+    if upper < math.inf:
+        return np.array([*logs, free_number(value[-1], lower, upper)])
+    return np.array([free_number(value[0], lower, upper), *logs])
 
 
 def parameter_bounds(trace: Trace) -> list[tuple[float, float]] | None:
     """Bounds of every component; None where some depend on other parameters, or a parameter is
-    not made of free numbers (a simplex, a positive definite matrix)."""
+    not made of free numbers (`Support.tied`)."""
     out = []
     for site in trace.parameters.values():
         support = site.distribution.support()
-        if support.kind in ("simplex", "positive definite"):
+        if support.tied:
             return None
         for pair in zip(array(support.lower).ravel(), array(support.upper).ravel(), strict=True):
             if any(e.op != "const" for e in pair):
