@@ -23,6 +23,7 @@ import numpy as np
 from scipy import stats
 
 import ssmppl as ssm
+from tests.models import constrained
 from tests.models import standard as models
 from tests.models import wider as wider_models
 
@@ -127,7 +128,8 @@ STUDIES = {
 
 
 def model_of(study: Study) -> ssm.Model:
-    return getattr(wider_models if hasattr(wider_models, study.model) else models, study.model)
+    homes = (models, wider_models, constrained)
+    return next(getattr(m, study.model) for m in homes if hasattr(m, study.model))
 
 
 def inputs_of(model: ssm.Model) -> dict[str, np.ndarray]:

@@ -101,6 +101,8 @@ class Search:
 
     def _positive(self, component: Expr) -> bool:
         lower = self.bound[component][0]
+        while lower in self.bound and lower.data[1] == component.data[1]:  # the one below it
+            lower = self.bound[lower][0]
         return lower.op == "const" and lower.data >= 0.0
 
     def _judged(
