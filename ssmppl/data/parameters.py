@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.data.values import Fault, as_numbers, asymmetry, number, outside, short, without_unit_diagonal
+from ssmppl.data.values import (
+    Fault,
+    as_numbers,
+    asymmetry,
+    number,
+    outside,
+    short,
+    without_unit_diagonal,
+)
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model.trace import Site, Trace

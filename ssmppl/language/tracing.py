@@ -32,7 +32,7 @@ from ssmppl.language.checks.rules import (
     check_states,
 )
 from ssmppl.language.distributions.base import Distribution
-from ssmppl.language.distributions.multivariate import with_unit_diagonal
+from ssmppl.language.distributions.vectors.correlations import with_unit_diagonal
 from ssmppl.language.model.calling import call, call_once, check_outer_names, return_location
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of

@@ -156,7 +156,10 @@ def _pair(problem: Problem, walked: dict[str, np.ndarray], var_names: Any) -> li
     known = _labels(problem)
     found = pick(known, var_names, "the parameters of the model")
     if var_names is None:
-        found = [k for k in found if not walked or k in walked][:2]
+        parameters = problem.trace.parameters.values()
+        ones = {problem.trace.label(s) for site in parameters if site.distribution.unit_diagonal
+                for s in np.diagonal(site.value.view(np.ndarray))}  # fmt: skip
+        found = [k for k in found if k not in ones and (not walked or k in walked)][:2]
     if len(known) < 2:
         raise ArgumentError(
             f"a surface is over two parameters, and the model has {len(known)}",

@@ -76,7 +76,7 @@ def plot_prior_posterior(
     """
     draws = parameter_draws(idata, "plot_prior_posterior")
     before = _priors(idata, prior)
-    names = pick(draws, var_names, "the parameters of the posterior")
+    names = _moving(draws, pick(draws, var_names, "the parameters of the posterior"), var_names)
     names = few(names, "plot_prior_posterior")
     missing = [n for n in names if n not in before]
     if missing:
@@ -90,6 +90,22 @@ def plot_prior_posterior(
         one.set_xlabel(name)
     key(axes, ax)
     return handed(axes)
+
+
+def _moving(values: dict[str, np.ndarray], names: list[str], var_names: Any) -> list[str]:
+    """The names without the entries of matrices that were not asked for one by one and say nothing
+    of their own: the other half of a symmetric one, and the diagonal of correlations."""
+    asked = {var_names} if isinstance(var_names, str) else set(var_names or ())
+    kept: list[str] = []
+    for name in names:
+        own, stem = values[name], name.split("[")[0]
+        beside = [values[k] for k in kept if k.split("[")[0] == stem]
+        entry = "," in name.partition("[")[2]
+        still = bool(np.all(own == 1.0))
+        copied = any(np.array_equal(own, v) for v in beside)
+        if name in asked or not entry or not (still or copied):
+            kept.append(name)
+    return kept or names
 
 
 def _priors(idata: Any, prior: Any) -> dict[str, Prior]:
@@ -168,7 +184,7 @@ def plot_maximization(estimate: Any, *, var_names: Any = None, ax: Any = None) -
     if not isinstance(estimate, Estimate):
         raise wrong_kind("plot_maximization", estimate, "give what ssm.maximize returns")
     paths, figures = iterates_of(estimate)
-    names = pick(paths, var_names, "the parameters that were estimated")
+    names = _moving(paths, pick(paths, var_names, "the parameters that were estimated"), var_names)
     names = few(names, "plot_maximization")
     if not names:
         raise ArgumentError(

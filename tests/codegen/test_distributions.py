@@ -169,6 +169,12 @@ def marginals(case):
     if case.cls is D.Dirichlet:
         a = np.array(p["concentration"])
         return {i: st.beta(a[i], a.sum() - a[i]) for i in range(len(a))}
+    if case.cls is D.LogisticNormal:
+        return {}
+    if case.cls is D.MvStudentT:
+        sd = np.sqrt(np.diag(case.reference.shape))
+        loc = case.reference.loc
+        return {i: st.t(p["df"], loc[i], sd[i]) for i in range(len(sd))}
     scale, df = np.array(p["scale"]), p["df"]
     n = len(scale)
     if case.cls is D.Wishart:
@@ -201,6 +207,15 @@ def test_joint_laws(case):
         few = few[:, inside]
         few = few / few.sum(axis=0)  # SciPy asks for a sum of 1 to the last digit
         expected = [case.reference.logpdf(v[:-1]) for v in few.T]
+    elif case.cls is D.LogisticNormal:
+        expected = [case.reference.logpdf(v) for v in few.T]
+        own, v = case.reference.ratios, np.arange(1.0, len(x))
+        sd = math.sqrt(v @ np.atleast_2d(own.cov) @ v)
+        check_sample(v @ np.log(x[:-1] / x[-1]), st.norm(v @ np.atleast_1d(own.mean), sd), False)
+    elif case.cls is D.MvStudentT:
+        expected, v = case.reference.logpdf(few.T), np.arange(1.0, len(x) + 1)
+        sd = math.sqrt(v @ case.reference.shape @ v)
+        check_sample(v @ x, st.t(case.parameters["df"], v @ case.reference.loc, sd), False)
     else:
         expected = case.reference.logpdf(few.T)
         v = np.arange(1.0, len(x) + 1)

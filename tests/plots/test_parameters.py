@@ -254,3 +254,25 @@ def test_a_surface_needs_two_parameters_with_limits(options, found):
 def test_where_there_is_no_likelihood_nothing_is_drawn():
     with pytest.raises(ArgumentError, match="finite nowhere"):
         ssm.plot_likelihood(level, data(), limits={"q": (-2, -1), "r": (-2, -1)}, points=3)
+
+
+def test_of_correlations_each_is_drawn_once():
+    """Not the diagonal, nor the other half, unless they are asked for."""
+    model = ssm.Model("correlated")
+    model.prior(lambda: {"R": ssm.LKJ(2, 2), "sd": ssm.HalfNormal(sd=np.ones(2))})
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(2), sd=1)})
+    model.transition(lambda x, R, sd: {
+        "x": ssm.MvNormal(0.5 * x, covariance=sd[:, None] * R * sd[None, :])
+    })  # fmt: skip
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=0.3)})
+    data = {"y": np.random.default_rng(1).standard_normal((30, 2))}
+    idata = ssm.sample(model, data, draws=20, warmup=20, chains=2, seed=1, progress=False)
+    drawn = [a.get_xlabel() for a in np.ravel(ssm.plot_prior_posterior(idata, model))]
+    assert drawn == ["R[0, 1]", "sd[0]", "sd[1]"]
+    asked = ssm.plot_prior_posterior(idata, model, var_names=["R[1, 0]", "sd"])
+    assert [a.get_xlabel() for a in np.ravel(asked)] == ["R[1, 0]", "sd[0]", "sd[1]"]
+    estimate = ssm.maximize(model, data, seed=1)
+    shown = [a.get_ylabel() for a in np.ravel(ssm.plot_maximization(estimate))]
+    assert shown[:3] == ["R[0, 1]", "sd[0]", "sd[1]"]
+    surface = ssm.plot_likelihood(model, data, estimate, points=3)
+    assert [surface.get_xlabel(), surface.get_ylabel()] == ["R[1, 0]", "sd[0]"]

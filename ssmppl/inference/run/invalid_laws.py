@@ -15,9 +15,9 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.distributions import (
     Distribution,
-    MvNormal,
     Truncated,
 )
+from ssmppl.language.distributions.multivariate import Centred
 from ssmppl.language.distributions.nested import SUM_ROUNDING
 from ssmppl.language.model.trace import Trace
 
@@ -63,12 +63,12 @@ def law_without_density_at(trace: Trace, theta: np.ndarray) -> tuple[str, str, L
 
 def _covariance(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, str] | None:
     """A covariance, or the inverse of one, that is not positive definite at these values."""
-    if not isinstance(law, MvNormal) or law.spread == "cholesky" or law.root is not None:
+    if not isinstance(law, Centred) or law.spread == "cholesky" or law.root is not None:
         return None
     entries = list(law.parameters[law.spread].ravel())
     if not symbols_of(entries) <= set(values):
         return None
-    n = len(law.mean_)
+    n = len(law.parameters[law.spread])
     with np.errstate(all="ignore"):
         matrix = np.array(evaluate(entries, values), dtype=float).reshape(n, n)
     try:
@@ -78,9 +78,10 @@ def _covariance(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, s
         pass
     rows = "; ".join(", ".join(f"{x:.6g}" for x in row) for row in matrix)
     return (
-        f"the {law.spread} of MvNormal, [{rows}], is not positive definite there",
+        f"the {law.spread} of {type(law).__name__}, [{rows}], is not positive definite there",
         "give its parameters priors that keep variances off zero and correlations off -1 and 1, as "
-        "ssm.InverseGamma does, or ssm.InverseWishart for the whole matrix",
+        "ssm.InverseGamma does, or ssm.InverseWishart for the whole matrix, or ssm.LKJ for the "
+        "correlations",
     )
 
 

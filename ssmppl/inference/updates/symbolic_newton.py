@@ -34,7 +34,8 @@ SMALL_STEP = 1e-12
 class Unconstrained:
     """theta -> the unconstrained numbers z of some of its components, compiled.
 
-    Of a simplex, a matrix or an ordered vector all components are members. z, transforms : in the trace's order.
+    Of a simplex, a matrix or an ordered vector all components are members. z, transforms : in the
+    trace's order.
     """
 
     def __init__(self, trace: Trace, components: Sequence[Expr]):

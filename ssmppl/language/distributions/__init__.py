@@ -20,14 +20,7 @@ from ssmppl.language.distributions.discrete import (
 )
 from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
-from ssmppl.language.distributions.multivariate import (
-    LKJ,
-    Dirichlet,
-    InverseWishart,
-    MvNormal,
-    Ordered,
-    Wishart,
-)
+from ssmppl.language.distributions.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
 from ssmppl.language.distributions.positive import Beta, Exponential, Gamma, InverseGamma, Weibull
 from ssmppl.language.distributions.symmetric import (
     Cauchy,
@@ -37,14 +30,19 @@ from ssmppl.language.distributions.symmetric import (
     StudentT,
 )
 from ssmppl.language.distributions.truncated import Truncated
+from ssmppl.language.distributions.vectors.correlations import LKJ
+from ssmppl.language.distributions.vectors.ordered import Ordered
+from ssmppl.language.distributions.vectors.shares import LogisticNormal
+from ssmppl.language.distributions.vectors.student import MvStudentT
 
 DISTRIBUTIONS: dict[str, type[Distribution]] = {
     cls.__name__: cls
     for cls in (
         Normal, MvNormal, LogNormal, StudentT, Laplace, Cauchy, HalfNormal, HalfCauchy, Uniform,
         Exponential, Weibull, Gamma, InverseGamma, Beta, VonMises, Dirichlet, Wishart,
-        InverseWishart, LKJ, Ordered, Poisson, NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical,
-        Dirac, Truncated, Mixture, ZeroInflated, Flat, HalfFlat,
+        InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson, NegativeBinomial,
+        Binomial, BetaBinomial, Bernoulli, Categorical, Dirac, Truncated, Mixture, ZeroInflated,
+        Flat, HalfFlat,
     )
 }  # fmt: skip
 

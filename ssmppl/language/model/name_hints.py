@@ -83,14 +83,22 @@ HINTS: dict[str, str] = {
     "skellam": "the difference of two draws of the step: ssm.Poisson(a) and ssm.Poisson(b) under "
     "names of their own, and ssm.Dirac of the difference",
     **dict.fromkeys(
-        ["mvstudentt", "multivariatestudentt", "mvt", "multivariatet"],
-        "ssm.MvNormal(mean, covariance=V / w), with w from ssm.Gamma(df / 2, rate=df / 2), a draw "
-        "of the step",
+        ["multivariatestudentt", "mvt", "multivariatet", "multistudentt", "multivariatestudent"],
+        "ssm.MvStudentT(df, loc, scale=), scale a matrix",
     ),
     **dict.fromkeys(
-        ["lkj", "lkjcorr", "lkjcholesky", "lkjcholeskycov"],
-        "ssm.InverseWishart(df, scale=) for a covariance matrix: there is no prior of a "
-        "correlation matrix alone",
+        ["lkjcorr", "lkjcholesky", "lkjcholeskycov", "lkjcorrcholesky"],
+        "ssm.LKJ(dim, eta), a correlation matrix R, and covariance=sd[:, None] * R * sd[None, :] "
+        "where it acts",
+    ),
+    **dict.fromkeys(
+        ["orderedvector", "positiveordered", "orderedtransform", "order"],
+        "ssm.Ordered(law), as ssm.Ordered(ssm.Normal(np.zeros(3), sd=5))",
+    ),
+    **dict.fromkeys(["simplex", "stickbreaking"], "ssm.Dirichlet(concentration), shares of sum 1"),
+    **dict.fromkeys(
+        ["softmaxnormal", "logitnormalmultivariate", "additivelogisticnormal"],
+        "ssm.LogisticNormal(mean, covariance=), shares of sum 1",
     ),
     **dict.fromkeys(["potential", "factor"], "a term of the log density as " + _OWN),
     **dict.fromkeys(["censored", "interval"], _OWN + ", the probability of what is beyond the "

@@ -3,8 +3,9 @@
 Numbers: identity, log, or logit between bounds (which may depend on earlier parameters).
 Probability vectors: stick breaking. Positive definite matrices: the Cholesky factor with the log of
 its diagonal. Correlation matrices: the inverse hyperbolic tangents of partial correlations.
-Increasing vectors: the logarithms of the gaps, or between two bounds, where a stick is broken. Stan Development Team (2024), "Stan reference manual", section "Constraint
-transforms", gives the Jacobians.
+Increasing vectors: the logarithms of the gaps, or between two bounds, where a stick is broken. Stan
+Development Team (2024), "Stan reference manual", section "Constraint transforms", gives the
+Jacobians.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ import numpy as np
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
-from ssmppl.language.distributions.multivariate import with_unit_diagonal
 from ssmppl.language.distributions.positive import LEAST_SHARE
+from ssmppl.language.distributions.vectors.correlations import with_unit_diagonal
 from ssmppl.language.model.trace import Site, Trace
 
 ZERO = constant(0.0)

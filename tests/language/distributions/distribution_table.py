@@ -264,6 +264,20 @@ def _inverse_wishart(df, scale):
     return st.invwishart(df, scale)
 
 
+class Ratios:
+    """Shares whose log ratios to the last are Gaussian, by SciPy's law of these."""
+
+    def __init__(self, mean, cov):
+        self.ratios = st.multivariate_normal(mean, cov)
+
+    def rvs(self, random_state):
+        powers = np.exp(np.append(self.ratios.rvs(random_state=random_state), 0.0))
+        return powers / powers.sum()
+
+    def logpdf(self, x):
+        return self.ratios.logpdf(np.log(x[:-1] / x[-1])) - np.log(x).sum()
+
+
 JOINT_CASES = [
     Case(D.MvNormal, {"mean": _M, "covariance": _A}, st.multivariate_normal(_M, _A)),
     Case(D.MvNormal, {"mean": _M, "precision": _A},
@@ -279,6 +293,16 @@ JOINT_CASES = [
     Case(D.Dirichlet, {"concentration": [0.05, 0.4, 2.0]}, st.dirichlet([0.05, 0.4, 2.0])),
     Case(D.Dirichlet, {"concentration": [200.0, 20.0, 2.0, 7.0]},
          st.dirichlet([200.0, 20.0, 2.0, 7.0])),
+    Case(D.LogisticNormal, {"mean": _M, "covariance": _A}, Ratios(_M, _A)),
+    Case(D.LogisticNormal, {"mean": [0.5], "precision": [[4.0]]}, Ratios([0.5], [[0.25]])),
+    Case(D.LogisticNormal, {"mean": _M, "cholesky": np.linalg.cholesky(_A)}, Ratios(_M, _A)),
+    Case(D.MvStudentT, {"df": 4.0, "loc": _M, "scale": _A}, st.multivariate_t(_M, _A, df=4.0)),
+    Case(D.MvStudentT, {"df": 0.8, "loc": _M, "cholesky": np.linalg.cholesky(_A)},
+         st.multivariate_t(_M, _A, df=0.8)),
+    Case(D.MvStudentT, {"df": 60.0, "loc": _M, "precision": _A},
+         st.multivariate_t(_M, np.linalg.inv(_A), df=60.0)),
+    Case(D.MvStudentT, {"df": 1.5, "loc": [3.0], "scale": [[0.25]]},
+         st.multivariate_t([3.0], [[0.25]], df=1.5)),
     Case(D.Wishart, {"df": 5.0, "scale": _A}, st.wishart(5.0, _A)),
     Case(D.Wishart, {"df": 2.5, "scale": _A}, st.wishart(2.5, _A)),
     Case(D.Wishart, {"df": 3.0, "scale": [[0.5]]}, st.wishart(3.0, [[0.5]])),
@@ -367,7 +391,9 @@ TRUNCATED_CASES = [
                 (1.0, _INF), (150.0, _INF), (-_INF, 3.0), (2.0, 20.0)),
 ]  # fmt: skip
 
-NOT_IN_SCIPY = {"Truncated", "Mixture", "ZeroInflated", "Dirac", "Flat", "HalfFlat"}
+NOT_IN_SCIPY = {
+    "Truncated", "Mixture", "ZeroInflated", "Dirac", "Flat", "HalfFlat", "LKJ", "Ordered",
+}  # fmt: skip
 
 
 def scalars(values: Any) -> ExprArray:

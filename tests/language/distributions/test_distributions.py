@@ -245,6 +245,24 @@ def test_joint_sampler_moments_and_support(case):
             law = st.beta(a[k], a.sum() - a[k])
             assert st.kstest(x[k], law.cdf).pvalue > LEVEL
             assert [mean[k], variance[k]] == pytest.approx([law.mean(), law.var()])
+    elif case.cls is D.LogisticNormal:
+        np.testing.assert_allclose(x.sum(0), 1.0, rtol=1e-12)
+        own = case.reference.ratios
+        away = np.log(x[:-1] / x[-1]) - np.reshape(own.mean, (-1, 1))
+        z = np.linalg.solve(np.linalg.cholesky(np.atleast_2d(own.cov)), away)
+        for row in z:
+            assert st.kstest(row, st.norm.cdf).pvalue > LEVEL
+        np.testing.assert_allclose(np.cov(z), np.eye(len(z)), atol=6 * math.sqrt(2 / n))
+        assert np.all(np.isnan(mean))
+    elif case.cls is D.MvStudentT:
+        own, df = case.reference, case.parameters["df"]
+        z = np.linalg.solve(np.linalg.cholesky(own.shape), x - own.loc[:, None])
+        for row in z:
+            assert st.kstest(row, st.t(df).cdf).pvalue > LEVEL
+        assert st.kstest((z**2).mean(axis=0), st.f(len(z), df).cdf).pvalue > LEVEL
+        np.testing.assert_allclose(mean, own.loc if df > 1 else np.nan)
+        finite = np.diag(own.shape) * (df / (df - 2)) if df > 2 else np.nan
+        np.testing.assert_allclose(variance, np.inf if 1 < df <= 2 else finite)
     else:
         wishart = case.cls is D.Wishart
         s, df, p = _matrix(case), case.parameters["df"], shape[0]

@@ -23,7 +23,8 @@ LAWS = {
     "Gamma": (ssm.Gamma(2.5, rate=np.full(3, 0.5)), stats.gamma(2.5, scale=2)),
     "Uniform": (ssm.Uniform(-1, np.full(3, 4.0)), stats.uniform(-1, 5)),
     "Beta": (ssm.Beta(np.full(3, 0.5), 2), stats.beta(0.5, 2)),
-    "below": (ssm.Truncated(ssm.Normal(np.zeros(3), sd=1), upper=0.5), stats.truncnorm(-np.inf, 0.5)),
+    "below": (ssm.Truncated(ssm.Normal(np.zeros(3), sd=1), upper=0.5),
+              stats.truncnorm(-np.inf, 0.5)),
 }  # fmt: skip
 named = pytest.mark.parametrize("name", LAWS)
 

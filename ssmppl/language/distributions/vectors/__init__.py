@@ -1,0 +1,1 @@
+"""Distributions of vectors and matrices that stand on those of `multivariate.py`."""
