@@ -14,7 +14,7 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import Distribution, Truncated
+from ssmppl.language.distributions import Censored, Distribution, Truncated
 from ssmppl.language.distributions.base import Support
 
 UNIT_ROUNDING = 1e-8  # by which a diagonal of ones may miss 1
@@ -216,8 +216,9 @@ def outside(
 
 def name_of(distribution: Distribution) -> str:
     """The distribution's name as in the language."""
-    if isinstance(distribution, Truncated):
-        return f"the truncated {name_of(distribution.base)}"
+    if isinstance(distribution, (Censored, Truncated)):
+        word = "truncated" if isinstance(distribution, Truncated) else "censored"
+        return f"the {word} {name_of(distribution.base)}"
     return type(distribution).__name__
 
 

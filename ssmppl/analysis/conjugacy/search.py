@@ -309,10 +309,10 @@ def bounds_of(site: Site) -> dict[Expr, tuple[Expr, Expr]]:
     lower = np.broadcast_to(support.lower.view(np.ndarray), site.shape).ravel()
     upper = np.broadcast_to(support.upper.view(np.ndarray), site.shape).ravel()
     if support.kind == "ordered":
-        rows = np.array(site.value.view(np.ndarray).reshape(-1, site.shape[-1]))
-        lower, upper = lower.reshape(rows.shape).copy(), upper.reshape(rows.shape).copy()
-        lower[:, 1:], upper[:, :-1] = rows[:, :-1], rows[:, 1:]
-        lower, upper = lower.ravel(), upper.ravel()
+        k, (lower, upper) = site.shape[-1], (lower.copy(), upper.copy())
+        for i, c in enumerate(site.value.ravel()):
+            if i % k:
+                lower[i], upper[i - 1] = site.value.ravel()[i - 1], c
     return {
         value: (low, high)
         for value, low, high in zip(site.value.ravel(), lower, upper, strict=True)

@@ -232,7 +232,7 @@ def predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
         below = strictly = nothing
     else:
         below = array(d.cdf(y))
-        strictly = array(d.cdf(array(y - 1.0))) if d.discrete else below
+        strictly = array(d.cdf_below(y)) if d.discrete or d.atoms else below
     forms = [array(np.broadcast_to(array(f).view(np.ndarray), site.shape))
              for f in (d.mean(), d.variance(), below, strictly)]  # fmt: skip
     first = {s: i for i, s in reversed(list(enumerate(y.ravel())))}

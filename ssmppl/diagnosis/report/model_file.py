@@ -29,7 +29,15 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.batched.call import OP
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
 from ssmppl.language.checks.new_values import SUFFIX
-from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
+from ssmppl.language.distributions import (
+    Censored,
+    Distribution,
+    Flat,
+    Mixture,
+    Ordered,
+    Truncated,
+    ZeroInflated,
+)
 from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
@@ -239,10 +247,12 @@ class _Writer:
             inside = [self._distribution(law, lines, room - 16) for law in d.components]
             parts = [f"[{', '.join(weights)}]", f"[{', '.join(inside)}]"]
             return _call(kind, parts, room)
+        if isinstance(d, Ordered):
+            return _call(kind, [self._distribution(d.base, lines, room - 12)], room)
         if isinstance(d, ZeroInflated):
             law = self._distribution(d.base, lines, room - 20)
             return _call(kind, [law, lines.array(d.p, scalar=_same(d.p))], room)
-        if isinstance(d, Truncated):
+        if isinstance(d, (Censored, Truncated)):
             bounds = {k: v for k, v in d.given_bounds().items() if not is_infinite(v)}
             wide = d.base.shape != d.shape
             inside = [self._distribution(d.base, lines, room - 16)]
@@ -450,9 +460,11 @@ def nodes_of(d: Distribution) -> list[Expr]:
     if isinstance(d, Mixture):
         own = [e for w in d.weights for e in w.ravel()]
         return [*own, *(e for law in d.components for e in nodes_of(law))]
+    if isinstance(d, Ordered):
+        return nodes_of(d.base)
     if isinstance(d, ZeroInflated):
         return [*nodes_of(d.base), *d.p.ravel()]
-    if isinstance(d, Truncated):
+    if isinstance(d, (Censored, Truncated)):
         return [*nodes_of(d.base), *(e for a in d.given_bounds().values() for e in a.ravel())]
     return [e for a in d.parameters.values() for e in array(a).ravel()]
 

@@ -122,6 +122,14 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
             fix=f"declare it in @prior, and name {name!r} as an argument where its value acts",
             where=where,
         )
+    if role != "observation" and distribution.atoms:
+        raise ModelError(
+            f"the distribution of {name!r} is {kind}, which observations alone have",
+            fix="give a state that stops at its limits a draw of the step and "
+            "ssm.Dirac(np.clip(draw_next, lower, upper)), or cut its distribution off by "
+            "ssm.Truncated",
+            where=where,
+        )
     allowed = role == "prior" or (role == "initial" and kind == "Flat")
     if not distribution.proper and not allowed:
         raise ModelError(

@@ -29,7 +29,7 @@ from ssmppl.language.distributions.symmetric import (
     Laplace,
     StudentT,
 )
-from ssmppl.language.distributions.truncated import Truncated
+from ssmppl.language.distributions.truncated import Censored, Truncated
 from ssmppl.language.distributions.vectors.correlations import LKJ
 from ssmppl.language.distributions.vectors.ordered import Ordered
 from ssmppl.language.distributions.vectors.shares import LogisticNormal
@@ -41,8 +41,8 @@ DISTRIBUTIONS: dict[str, type[Distribution]] = {
         Normal, MvNormal, LogNormal, StudentT, Laplace, Cauchy, HalfNormal, HalfCauchy, Uniform,
         Exponential, Weibull, Gamma, InverseGamma, Beta, VonMises, Dirichlet, Wishart,
         InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson, NegativeBinomial,
-        Binomial, BetaBinomial, Bernoulli, Categorical, Dirac, Truncated, Mixture, ZeroInflated,
-        Flat, HalfFlat,
+        Binomial, BetaBinomial, Bernoulli, Categorical, Dirac, Truncated, Censored, Mixture,
+        ZeroInflated, Flat, HalfFlat,
     )
 }  # fmt: skip
 

@@ -153,6 +153,7 @@ class Distribution:
     # What analyses make use of where it is known.
     truncatable = True  # whether `Truncated` takes it
     prior_only = False  # whether it is one of parameters alone
+    atoms = False  # whether single values of a continuous one have probability (observations only)
     gaussian_noise = False  # whether draws are made of normal ones alone; then it has `standard`
     maximisers: ClassVar[Mapping[str, Maximiser]] = {}  # by parameter, the others given
     highest: float | None = None  # what no log density is above, 0 of probabilities
@@ -332,6 +333,10 @@ class Distribution:
         """Distribution function, element by element (not for joint distributions)."""
         raise AttributeError
 
+    def cdf_below(self, value: ExprArray) -> ExprArray:
+        """P(X < value), element by element."""
+        return self.cdf(array(value) - 1.0 if self.discrete else value)
+
     def quantile(self, p: ExprArray) -> ExprArray:
         """Inverse of `cdf`: for discrete distributions the smallest value with cdf >= p."""
         raise AttributeError
@@ -485,10 +490,10 @@ class Distribution:
                 inside = apply("le" if closed else "lt", lower[i], v[i])
             if not (upper[i].op == "const" and upper[i].data == INFINITY):
                 below = apply("lt" if self.open_above else "le", v[i], upper[i])
-                inside = below if inside.op == "const" else apply("and", inside, below)
+                inside = below if inside is constant(1.0) else apply("and", inside, below)
             if self.discrete:
                 whole = apply("eq", v[i], apply("floor", v[i]))
-                inside = whole if inside.op == "const" else apply("and", inside, whole)
+                inside = whole if inside is constant(1.0) else apply("and", inside, whole)
             out[i] = apply("where", inside, density[i], -INFINITY)
         return array(out)
 

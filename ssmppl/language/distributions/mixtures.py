@@ -224,9 +224,10 @@ def _checked(components: Any) -> tuple[Distribution, ...]:
         )
     for law in components:
         name = type(law).__name__
-        if law.joint or isinstance(law, (Dirac, Flat)):
+        if law.joint or law.atoms or isinstance(law, (Dirac, Flat)):
             fix = {
                 "Categorical": "mix the probabilities: ssm.Categorical(w * p + (1 - w) * q)",
+                "Censored": "censor the mixture: ssm.Censored(ssm.Mixture(weights, [...]), lower=)",
                 "Dirac": "a distribution with an atom has no density; zeros among counts are "
                 "ssm.ZeroInflated(law, p)",
             }.get(name, "make the choice a state, ssm.Bernoulli(p) drawn in every row, and select "

@@ -1,7 +1,10 @@
-"""Truncated(dist, lower=, upper=): a distribution restricted to an interval.
+"""Truncated(dist, lower=, upper=): a distribution restricted to an interval; Censored, one of which
+what lies beyond limits is read as the limit (Tobin 1958, "Estimation of relationships for limited
+dependent variables", *Econometrica* 26).
 
-The log density is that of the base less log P(lower <= X <= upper); draws invert the base's
-distribution function on the part of (0, 1) that is left, from the tail that the interval is in.
+The log density of what is truncated is that of the base less log P(lower <= X <= upper); draws
+invert the base's distribution function on the part of (0, 1) that is left, from the tail that the
+interval is in.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import symbols_of, user_location
 from ssmppl.language.distributions.base import Distribution, Support, in_order, is_infinite, where
+from ssmppl.language.distributions.continuous import Flat
+from ssmppl.language.distributions.discrete import Dirac
 from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
 from ssmppl.language.distributions.nested import holding
@@ -321,6 +326,166 @@ class Truncated(Distribution):
             beside = ew("or", ew("le", kink, lower), ew("le", upper, kink))
             value = where(beside, self._quantile(p, q), value)
         return self._clip(value)
+
+
+class Censored(Distribution):
+    """Censored(dist, lower=, upper=): what is read of dist by an instrument with limits.
+
+    Values below `lower` are read as `lower`, with probability P(X <= lower), those above `upper` as
+    `upper`; between them the density is that of dist. For concentrations below a detection limit, a
+    sensor that saturates, a stock that is sold out. Where nothing is read at all beyond the limits,
+    `Truncated` is meant. For observations only.
+
+    Parameters
+    ----------
+    dist : a distribution of numbers, continuous or of whole numbers.
+    lower, upper : the limits, one of them or both: numbers, or inputs where they change from row to
+        row. In the data a value beyond a limit is the limit itself.
+
+    Raises
+    ------
+    ModelError : dist has no distribution function, no limit is given, lower is not below upper, or
+        a limit of whole numbers is none.
+    """
+
+    by_name = "limits"
+    truncatable = False
+    guards_range = True
+    closed = True
+    base: Distribution
+
+    def __init__(self, dist: Distribution, *, lower: Any = None, upper: Any = None):
+        known = isinstance(dist, Distribution)
+        if not known or dist.joint or dist.atoms or isinstance(dist, (Dirac, Flat)):
+            raise ModelError(
+                f"Censored: {type(dist).__name__ if known else repr(dist)} has no distribution "
+                "function",
+                fix="give a distribution of numbers, as ssm.Censored(ssm.Normal(x, sd=1), lower=0)",
+                where=user_location(),
+            )
+        if isinstance(dist, UserDefined) and not dist.has_cdf:
+            raise ModelError(
+                f"Censored: {dist.origin.name} has no distribution function",
+                fix=f"declare it: @{dist.origin.name}.cdf",
+                where=user_location(),
+            )
+        if lower is None and upper is None:
+            raise ModelError(
+                "Censored: neither lower nor upper was given",
+                fix="give lower=, upper= or both",
+                where=user_location(),
+            )
+        self._set(
+            lower=-math.inf if lower is None else lower,
+            upper=math.inf if upper is None else upper,
+            **{f"like_{n}": a for n, a in dist.parameters.items()},
+        )
+        if dist.shape != self.shape:  # limits for each element of what is one law
+            dist = dist.rebuilt({n: self.parameters[f"like_{n}"] for n in dist.parameters})
+        self.base, self.discrete, self.atoms = dist, dist.discrete, not dist.discrete
+        self.drawable = dist.drawable
+        for a, b in zip(self.lower.ravel(), self.upper.ravel(), strict=True):
+            if a.op == b.op == "const" and not a.data < b.data:
+                raise ModelError(
+                    f"Censored: lower = {a.data:g} is not below upper = {b.data:g}",
+                    fix="give lower < upper",
+                    where=self.location,
+                )
+        for name in ("lower", "upper") if self.discrete else ():
+            for e in self.parameters[name].ravel():
+                if e.op == "const" and math.isfinite(e.data) and e.data != math.floor(e.data):
+                    raise ModelError(
+                        f"Censored: {name} = {e.data:g} is no whole number, as {dist!r} is one of "
+                        "such",
+                        fix="give the limit that is read",
+                        where=self.location,
+                    )
+
+    def __repr__(self) -> str:
+        bounds = [
+            f"{name}={self.parameters[name].ravel()[0]!r}"
+            for name in ("lower", "upper")
+            if not is_infinite(self.parameters[name])
+        ]
+        return f"Censored({', '.join([repr(self.base), *bounds])})"
+
+    def given_bounds(self) -> dict[str, ExprArray]:
+        """Both limits."""
+        return {n: self.parameters[n] for n in ("lower", "upper")}
+
+    def rebuilt(self, parameters):
+        values = {**self.parameters, **parameters}
+        base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
+        bounds = {n: array(values[n]) for n in ("lower", "upper")}
+        given = {n: b for n, b in bounds.items() if not is_infinite(b)}
+        return self._at_place(Censored(base, **(given or bounds)))
+
+    def support(self):
+        own = self.base.support()
+        kind = "integers" if self.discrete else "interval"
+        lower = _tighter("maximum", own.lower, self.lower)
+        return Support(kind, lower, _tighter("minimum", own.upper, self.upper))
+
+    def in_range(self) -> ExprArray | None:
+        return holding([self.base.in_range(), in_order("lt", self.lower, self.upper)])
+
+    def log_densities(self, value):
+        v = array(value)
+        out = array(self.base.log_densities(v))
+        if not is_infinite(self.lower):
+            out = where(ew("le", v, self.lower), self.base.log_cdf(self.lower), out)
+        if not is_infinite(self.upper):
+            above = self.upper - 1.0 if self.discrete else self.upper
+            out = where(ew("le", self.upper, v), self.base.log_survival(array(above)), out)
+        return out
+
+    def _read(self, value: Any) -> ExprArray:
+        return array(ew("minimum", self.upper, ew("maximum", self.lower, value)))
+
+    def sample(self, draws):
+        return self._read(self.base.sample(draws))
+
+    def cdf(self, value):
+        inside = where(ew("lt", value, self.lower), 0.0, self.base.cdf(array(value)))
+        return where(ew("le", self.upper, value), 1.0, inside)
+
+    def cdf_below(self, value):
+        inside = where(ew("le", value, self.lower), 0.0, self.base.cdf_below(array(value)))
+        return where(ew("lt", self.upper, value), 1.0, inside)
+
+    def quantile(self, p):
+        return self._read(self.base.quantile(p))
+
+    def noise_free(self):
+        return self._read(self.base.noise_free())
+
+    def mean(self):
+        return self._moments()[0]
+
+    def variance(self):
+        return self._moments()[1]
+
+    def _moments(self) -> tuple[ExprArray, ExprArray]:
+        """Of what is between the limits, and the limits with their probabilities."""
+        inner = self.base
+        if not all(inner.open_sides(self.lower, self.upper)):
+            own = {n: b for n, b in self.given_bounds().items() if not is_infinite(b)}
+            inner = Truncated(inner, **own)
+        inside = array(ew("exp", self.base.log_mass(self.lower, self.upper)))
+        mean, variance = inner.mean(), inner.variance()
+        shares, first = [(inside, mean)], inside * mean
+        limits = (
+            (self.lower, array(self.base.cdf_below(self.lower))),
+            (self.upper, self.base.survival(self.upper)),
+        )
+        for limit, share in limits:
+            if not is_infinite(limit):
+                shares.append((share, limit))
+                first = first + share * limit
+        second = inside * variance
+        for share, value in shares:
+            second = second + share * (value - first) ** 2
+        return array(first), array(second)
 
 
 def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[float, float, float]]:

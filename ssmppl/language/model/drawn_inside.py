@@ -23,7 +23,7 @@ from ssmppl.language.distributions.base import DistributionAsNumber
 from ssmppl.language.model.closure_digest import plain_function
 
 # Functions whose arguments may be distributions.
-_TAKE_DISTRIBUTIONS = ("Mixture", "Truncated", "ZeroInflated")
+_TAKE_DISTRIBUTIONS = ("Censored", "Mixture", "Ordered", "Truncated", "ZeroInflated")
 LONGEST = 80  # characters of a line
 # The type of an operand in messages of Python and NumPy; other words may be the user's own.
 _TYPE = re.compile(r"'([A-Z]\w+)'|\btype ([A-Z]\w+)\b")

@@ -101,8 +101,11 @@ HINTS: dict[str, str] = {
         "ssm.LogisticNormal(mean, covariance=), shares of sum 1",
     ),
     **dict.fromkeys(["potential", "factor"], "a term of the log density as " + _OWN),
-    **dict.fromkeys(["censored", "interval"], _OWN + ", the probability of what is beyond the "
-                    "limit among its values"),
+    **dict.fromkeys(
+        ["tobit", "clipped", "detectionlimit", "leftcensored", "rightcensored"],
+        "ssm.Censored(dist, lower=, upper=)",
+    ),
+    "interval": _OWN + ", the probability of each interval among its values",
 }  # fmt: skip
 MISSPELT = 4  # letters to one of which is wrong, left out, too many, or swapped with the next
 

@@ -54,6 +54,32 @@ def test_every_candidate_of_every_model_is_written(where, name):
     assert_round_trip(augment(t, found))
 
 
+def test_priors_of_vectors_are_written_as_they_are():
+    model = ssm.Model("vectors")
+
+    @model.prior
+    def prior():
+        return {
+            "R": ssm.LKJ(3, 1.5), "p": ssm.LogisticNormal([0.5, -1], covariance=np.eye(2)),
+            "level": ssm.Ordered(ssm.Normal(np.zeros(3), sd=2)),
+            "rate": ssm.Ordered(ssm.Gamma([1.0, 3.0], rate=0.5)),
+        }  # fmt: skip
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(np.zeros(3), sd=1)}
+
+    @model.transition
+    def transition(x, R, p, level, rate):
+        return {"x": ssm.MvStudentT(5, level + p * x, scale=rate[0] * R)}
+
+    @model.observation
+    def observation(x, rate):
+        return {"y": ssm.Normal(x, sd=rate[1])}
+
+    assert_round_trip(trace(model))
+
+
 def model_of(mean, **more):
     """A model whose observation has the given mean of x, z, a, P."""
     model = ssm.Model("made")

@@ -393,6 +393,7 @@ TRUNCATED_CASES = [
 
 NOT_IN_SCIPY = {
     "Truncated", "Mixture", "ZeroInflated", "Dirac", "Flat", "HalfFlat", "LKJ", "Ordered",
+    "Censored",
 }  # fmt: skip
 
 

@@ -30,6 +30,7 @@ NAMES = {
     "lkj": "write ssm.LKJ",
     "MultivariateStudentT": "write ssm.MvStudentT(df, loc, scale=)",
     "positive_ordered": "write ssm.Ordered(law)",
+    "Tobit": "write ssm.Censored(dist, lower=, upper=)",
     "Simplex": "write ssm.Dirichlet(concentration)",
     "prior": 'write model = ssm.Model("name"), and then @model.prior',
     "transition": 'write model = ssm.Model("name"), and then @model.transition',

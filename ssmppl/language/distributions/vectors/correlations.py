@@ -50,13 +50,14 @@ class LKJ(Joint):
     prior_only = True
 
     def __init__(self, dim: int, eta: Any):
-        if isinstance(dim, bool) or not isinstance(dim, (int, np.integer)) or dim < 2:
+        whole = _whole(dim)
+        if whole < 2:
             raise ModelError(
                 f"LKJ: dim is {dim!r}",
                 fix="give the number of rows, a whole number of at least 2: ssm.LKJ(2, eta=2)",
                 where=user_location(),
             )
-        self._set(eta=eta)
+        self._set(dim=whole, eta=eta)
         if self.eta.ndim:
             raise ModelError(
                 f"LKJ: eta has shape {self.eta.shape}",
@@ -64,14 +65,8 @@ class LKJ(Joint):
                 where=self.location,
             )
         self._require("eta", 0.0)
-        self.dim = int(dim)
-        self.shape = (self.dim, self.dim)
-
-    def __repr__(self) -> str:
-        return f"LKJ(dim={self.dim}, eta={self.eta[()]!r})"
-
-    def rebuilt(self, parameters):
-        return self._at_place(LKJ(self.dim, parameters.get("eta", self.eta)))
+        self.dim = whole
+        self.shape = (whole, whole)
 
     def support(self):
         ones = np.eye(self.dim)
@@ -117,6 +112,13 @@ class LKJ(Joint):
 
     def variance(self):
         return array((1.0 - np.eye(self.dim)) / (2.0 * self._exponents()[0] + 1.0))
+
+
+def _whole(dim: Any) -> int:
+    """A number of rows, of a distribution too that is built again; 0 where it is none."""
+    if isinstance(dim, ExprArray) and dim.shape == () and dim[()].op == "const":
+        dim = int(dim[()].data)
+    return int(dim) if isinstance(dim, (int, np.integer)) and not isinstance(dim, bool) else 0
 
 
 def with_unit_diagonal(matrix: Any) -> ExprArray:

@@ -56,7 +56,7 @@ class Ordered(Joint):
 
     def __init__(self, law: Distribution):
         where = user_location()
-        if not isinstance(law, Distribution) or law.joint or law.discrete:
+        if not isinstance(law, Distribution) or law.joint or law.discrete or law.atoms:
             raise ModelError(
                 f"Ordered: {law!r} is no continuous distribution of independent components",
                 fix="give one such as ssm.Ordered(ssm.Normal(np.zeros(2), sd=5))",
