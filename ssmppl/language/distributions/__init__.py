@@ -21,12 +21,20 @@ from ssmppl.language.distributions.discrete import (
 from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
 from ssmppl.language.distributions.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
-from ssmppl.language.distributions.positive import Beta, Exponential, Gamma, InverseGamma, Weibull
+from ssmppl.language.distributions.positive import (
+    Beta,
+    Exponential,
+    Gamma,
+    InverseGamma,
+    Pareto,
+    Weibull,
+)
 from ssmppl.language.distributions.symmetric import (
     Cauchy,
     HalfCauchy,
     HalfNormal,
     Laplace,
+    Logistic,
     StudentT,
 )
 from ssmppl.language.distributions.truncated import Censored, Truncated
@@ -38,11 +46,11 @@ from ssmppl.language.distributions.vectors.student import MvStudentT
 DISTRIBUTIONS: dict[str, type[Distribution]] = {
     cls.__name__: cls
     for cls in (
-        Normal, MvNormal, LogNormal, StudentT, Laplace, Cauchy, HalfNormal, HalfCauchy, Uniform,
-        Exponential, Weibull, Gamma, InverseGamma, Beta, VonMises, Dirichlet, Wishart,
-        InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson, NegativeBinomial,
-        Binomial, BetaBinomial, Bernoulli, Categorical, Dirac, Truncated, Censored, Mixture,
-        ZeroInflated, Flat, HalfFlat,
+        Normal, MvNormal, LogNormal, StudentT, Laplace, Logistic, Cauchy, HalfNormal, HalfCauchy,
+        Uniform, Exponential, Weibull, Pareto, Gamma, InverseGamma, Beta, VonMises, Dirichlet,
+        Wishart, InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson,
+        NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical, Dirac, Truncated,
+        Censored, Mixture, ZeroInflated, Flat, HalfFlat,
     )
 }  # fmt: skip
 

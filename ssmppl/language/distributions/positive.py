@@ -1,4 +1,4 @@
-"""Exponential, Weibull, Gamma, InverseGamma and Beta, elementwise of arrays.
+"""Exponential, Weibull, Pareto, Gamma, InverseGamma and Beta, elementwise of arrays.
 
 Densities, moments and quantiles as in Johnson, Kotz and Balakrishnan (1994, 1995),
 "Continuous univariate distributions", volumes 1 and 2, in the parametrisations named in each class.
@@ -183,6 +183,85 @@ class Weibull(_Positive):
     def quantile_between(self, p, q, lower, upper):
         bounds = self._used(lower), self._used(upper)
         return self._back(self._hazard.quantile_between(p, q, *bounds))
+
+    def location_and_scale(self):
+        return self._full(0.0), self.scale
+
+
+class Pareto(Distribution):
+    """Pareto(shape, scale=): P(X > x) = ``(scale / x)^shape`` from scale on.
+
+    Sizes of floods, claims, cities above a threshold: tails of a power law.
+
+    Parameters
+    ----------
+    shape : positive, the exponent of the tail; with 1 or less there is no mean, with 2 or less no
+        variance.
+    scale : positive, the least value.
+    """
+
+    closed = True
+    maximisers: ClassVar = {
+        "shape_": lambda law, value: 1.0 / (ew("log", value) - ew("log", law.scale)),
+    }
+
+    def __init__(self, shape: Any, *, scale: Any):
+        self._set(shape_=shape, scale=scale)
+        self._require("shape_", 0.0)
+        self._require("scale", 0.0)
+        self._logs = Exponential(rate=self.shape_)  # the law of log(X / scale)
+
+    def support(self):
+        return Support("interval", self.scale, self._full(INFINITY))
+
+    def _log(self, value: Any) -> ExprArray:
+        """log(x / scale), 0 below the scale."""
+        beyond = array(ew("maximum", array(value) - self.scale, 0.0))
+        return array(ew("log1p", beyond / self.scale))
+
+    def _back(self, logs: Any) -> ExprArray:
+        return self.scale * ew("exp", logs)
+
+    def log_densities(self, value):
+        logs = array(ew("log", value))
+        away = logs - ew("log", self.scale)
+        return ew("log", self.shape_) - logs - self.shape_ * away
+
+    def sample(self, draws):
+        return self._back(self._logs.sample(draws))
+
+    def mean(self):
+        a = self.shape_
+        return where(ew("lt", 1.0, a), a * self.scale / (a - 1.0), INFINITY)
+
+    def variance(self):
+        a = self.shape_
+        finite = a * self.scale**2 / ((a - 1.0) ** 2 * (a - 2.0))
+        return where(ew("lt", 2.0, a), finite, where(ew("lt", 1.0, a), INFINITY, math.nan))
+
+    def has_moment(self, power):
+        return array(ew("lt", float(power), self.shape_))
+
+    def cdf(self, value):
+        return self._logs.cdf(self._log(value))
+
+    def survival(self, value):
+        return self._logs.survival(self._log(value))
+
+    def log_survival(self, value):
+        return self._logs.log_survival(self._log(value))
+
+    def quantile(self, p):
+        return self._back(self._logs.quantile(p))
+
+    def survival_quantile(self, p):
+        return self._back(self._logs.survival_quantile(p))
+
+    def log_mass(self, lower, upper):
+        return self._logs.log_mass(self._log(lower), self._log(upper))
+
+    def quantile_between(self, p, q, lower, upper):
+        return self._back(self._logs.quantile_between(p, q, self._log(lower), self._log(upper)))
 
     def location_and_scale(self):
         return self._full(0.0), self.scale

@@ -171,6 +171,48 @@ class Laplace(_Symmetric):
         return self.loc + self.scale * where(crosses, across, one_side)
 
 
+class Logistic(_Symmetric):
+    """Logistic(loc, scale=): tails between those of Normal and Laplace; P(X <= x) is the logistic
+    function of (x - loc) / scale.
+
+    Parameters
+    ----------
+    loc : its mean.
+    scale : positive; the variance is pi^2 scale^2 / 3.
+    """
+
+    def __init__(self, loc: Any, *, scale: Any):
+        self._set(loc=loc, scale=scale)
+        self._require("scale", 0.0)
+
+    def _z(self, value: Any) -> ExprArray:
+        return array((array(value) - self.loc) / self.scale)
+
+    def log_densities(self, value):
+        return self.log_cdf(value) + self.log_survival(value) - ew("log", self.scale)
+
+    def sample(self, draws):
+        return self.quantile(self._each(lambda i: draws.uniform()))
+
+    def mean(self):
+        return self.loc
+
+    def variance(self):
+        return (math.pi**2 / 3.0) * self.scale**2
+
+    def _standard_cdf(self, z):
+        return 1.0 / (1.0 + array(ew("exp", -z)))
+
+    def _standard_quantile(self, p):
+        return array(ew("log", p)) - ew("log1p", -p)
+
+    def log_cdf(self, value):
+        return -array(ew("logaddexp", 0.0, -self._z(value)))
+
+    def log_survival(self, value):
+        return -array(ew("logaddexp", 0.0, self._z(value)))
+
+
 def cut_exponential(p: ExprArray, q: ExprArray, width: ExprArray) -> ExprArray:
     """Quantile at p, q = 1 - p of an exponential with unit rate restricted to [0, width]."""
     near_zero = ew("log1p", p * array(ew("expm1", -width)))

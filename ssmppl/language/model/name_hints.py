@@ -69,15 +69,12 @@ HINTS: dict[str, str] = {
     **dict.fromkeys(["mle", "optimize", "optimise"], "ssm.maximize(model, data)"),
     **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
     **dict.fromkeys(
-        ["skewnormal", "skewstudentt", "logistic", "inversegaussian", "wald", "kumaraswamy",
+        ["skewnormal", "skewstudentt", "inversegaussian", "wald", "kumaraswamy",
          "asymmetriclaplace", "exgaussian", "exmodnormal", "genextreme", "generalizedpareto"],
         _OWN,
     ),
-    **dict.fromkeys(
-        ["pareto"],
-        "ssm.Exponential(rate=alpha) for the logarithm of x / x_min, and x_min * np.exp of it "
-        "where it acts; or " + _OWN,
-    ),
+    **dict.fromkeys(["paretoi", "powerlaw"], "ssm.Pareto(shape, scale=), from scale on"),
+    **dict.fromkeys(["sech2", "logisticdistribution"], "ssm.Logistic(loc, scale=)"),
     "gumbel": "loc - scale * np.log(e), with e from ssm.Exponential(rate=1), where it acts; or "
     + _OWN,
     "skellam": "the difference of two draws of the step: ssm.Poisson(a) and ssm.Poisson(b) under "

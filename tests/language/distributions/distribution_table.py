@@ -88,6 +88,11 @@ def _weibull(shape, scale):
     return st.weibull_min(shape, scale=scale)
 
 
+def _pareto(shape, scale):
+    """SciPy's pareto loses its lower tail; lomax, the excess over the scale, does not."""
+    return st.lomax(shape, loc=scale, scale=scale)
+
+
 class Counted:
     """A law of counts by its masses at 0, 1, ..., both tails summed from their own ends."""
 
@@ -220,6 +225,11 @@ CASES = [
     Case(D.Weibull, {"shape": 1.7, "scale": 3.0}, _weibull(1.7, 3.0)),
     Case(D.Weibull, {"shape": 0.6, "scale": 0.02}, _weibull(0.6, 0.02)),
     Case(D.Weibull, {"shape": 25.0, "scale": 400.0}, _weibull(25.0, 400.0)),
+    Case(D.Logistic, {"loc": 0.0, "scale": 1.0}, st.logistic()),
+    Case(D.Logistic, {"loc": -40.0, "scale": 0.03}, st.logistic(-40.0, 0.03)),
+    Case(D.Pareto, {"shape": 2.5, "scale": 1.2}, _pareto(2.5, 1.2)),
+    Case(D.Pareto, {"shape": 0.7, "scale": 300.0}, _pareto(0.7, 300.0)),
+    Case(D.Pareto, {"shape": 40.0, "scale": 1e-3}, _pareto(40.0, 1e-3)),
     Case(D.VonMises, {"mean": 0.0, "concentration": 2.0}, Circle(0.0, 2.0)),
     Case(D.VonMises, {"mean": 0.4, "concentration": 0.1}, Circle(0.4, 0.1)),
     Case(D.VonMises, {"mean": -2.8, "concentration": 1.5}, Circle(-2.8, 1.5)),
@@ -363,6 +373,10 @@ TRUNCATED_CASES = [
     *_truncated(D.StudentT, {"df": 5.0, "loc": 1.0, "scale": 2.0}, st.t(5, 1.0, 2.0),
                 (0.0, _INF), (1e4, _INF), (-_INF, -1e4), (-3.0, 4.0), (200.0, 300.0)),
     *_truncated(D.StudentT, {"df": 1.5, "loc": 0.0, "scale": 1.0}, st.t(1.5), (1.0, _INF)),
+    *_truncated(D.Logistic, {"loc": 1.0, "scale": 2.0}, st.logistic(1.0, 2.0), (0.0, _INF),
+                (-3.0, 4.0), (90.0, _INF), (-_INF, -90.0)),
+    *_truncated(D.Pareto, {"shape": 3.0, "scale": 1.5}, _pareto(3.0, 1.5), (2.0, _INF),
+                (-_INF, 4.0), (1e6, _INF), (2.0, 3.0), (0.5, 9.0)),
     *_truncated(D.Gamma, {"shape": 2.5, "rate": 0.5}, _gamma(2.5, 0.5), (1.0, _INF),
                 (-_INF, 0.01), (150.0, _INF), (3.0, 4.0), (200.0, 210.0)),
     *_truncated(D.Exponential, {"rate": 2.0}, st.expon(scale=0.5), (1.0, _INF), (-_INF, 0.3),
