@@ -12,10 +12,8 @@ import numpy as np
 
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import ExprArray, array, elementwise, inverse, log_determinant
-from ssmppl.expressions.expr import Expr, apply, attributed, constant
-from ssmppl.language.distributions import MvNormal
-from ssmppl.language.distributions.continuous import LOG_2PI
-from ssmppl.language.distributions.multivariate import surely_positive, where_definite
+from ssmppl.expressions.expr import Expr, apply, as_expr, attributed, constant
+from ssmppl.language.distributions.multivariate import Centred, surely_positive, where_definite
 from ssmppl.language.model.trace import Site, Trace, seen
 
 
@@ -80,8 +78,8 @@ def _observed(site: Site, missing: Missing, guard: bool) -> list[Term]:
         return [Term(site, d.log_density(site.value, guard), None)]
     masks = array([seen(s) for s in site.components])
     if d.joint:
-        if site.name in missing.partial and isinstance(d, MvNormal):
-            return [Term(site, marginal_normal(d, site.value, masks, guard), any_of(masks))]
+        if site.name in missing.partial and isinstance(d, Centred) and d.margins:
+            return [Term(site, marginal_density(d, site.value, masks, guard), any_of(masks))]
         return [Term(site, d.log_density(site.value, guard), masks[0])]
     densities = d.guarded_log_densities(site.value) if guard else d.log_densities(site.value)
     flat = array(np.broadcast_to(array(densities).view(np.ndarray), site.shape)).ravel()
@@ -96,21 +94,21 @@ def any_of(masks: ExprArray) -> Expr:
     return total
 
 
-def marginal_normal(d: MvNormal, value: ExprArray, masks: ExprArray, guard: bool = True) -> Expr:
-    """Log density of the measured components of a Gaussian vector.
+def marginal_density(d: Centred, value: ExprArray, masks: ExprArray, guard: bool = True) -> Expr:
+    """Log density of the measured components of a Gaussian or Student vector.
 
     With m the 0/1 vector of measured components, the marginal distribution of these is that of m *
-    y under covariance (m m') * C + diag(1 - m), less the unit variances of the others.
+    y with the matrix (m m') * C + diag(1 - m), for so many components as were measured.
 
     guard : -inf where what was measured has no covariance that is positive definite. The formula
         may have any value there, +inf too: [[0, c], [c, 1]], whose 0 is a square that underflowed,
         has an inverse and a determinant.
     """
-    whole = d.covariance_matrix()
-    residual = where_measured(masks, value - d.mean_)
+    whole = d.whole_matrix()
+    residual = where_measured(masks, value - d.centre)
     covariance = mask_covariance(whole, masks)
     quadratic = residual @ inverse(covariance) @ residual
-    density = -0.5 * (np.sum(masks) * LOG_2PI + log_determinant(covariance) + quadratic)
+    density = as_expr(d.of_form(quadratic, -0.5 * log_determinant(covariance), np.sum(masks)))
     if not guard or surely_positive(whole):
         return density
     return where_definite(covariance, density)

@@ -25,8 +25,8 @@ from ssmppl.data.time_steps import with_time_step
 from ssmppl.data.values import name_of, number, outside
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
-from ssmppl.language.distributions import MvNormal
 from ssmppl.language.distributions.base import Support
+from ssmppl.language.distributions.multivariate import Centred
 from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Site, Trace
 
 
@@ -279,7 +279,8 @@ def _check_observation(
     partly = gaps.any(axis=1) & ~gaps.all(axis=1)
     if not partly.any():
         return False
-    if site.distribution.joint and not isinstance(site.distribution, MvNormal):
+    law = site.distribution
+    if law.joint and not (isinstance(law, Centred) and law.margins):
         row = int(np.argmax(partly))
         raise DataError(
             f"a part of the observation is missing: {values[row].tolist()}; "

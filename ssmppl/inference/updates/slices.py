@@ -194,37 +194,41 @@ def sweep_matrix(
 def sweep_correlations(
     log_density: Density, values: Sequence[float], size: int, rng: np.random.Generator
 ) -> list[float]:
-    """Slice steps over partial correlations tanh z, those of row i given the columns before j.
+    """Slice steps over the inverse hyperbolic tangents of partial correlations."""
+    cells = lower_half(size)
+
+    def at(z: Sequence[float]) -> float:
+        root, log_jacobian = correlations_at(z, size)
+        value = root @ root.T
+        if not _kept(value, np.diagonal(root)):
+            return -math.inf
+        return log_density([1.0 if i == j else value[i, j] for i, j in cells]) + log_jacobian
+
+    start = free_correlations(symmetric(values, size)).tolist()
+    root, _ = correlations_at(
+        sweep_real(at, start, [(-math.inf, math.inf)] * len(start), rng), size
+    )
+    value = root @ root.T
+    return [1.0 if i == j else float(value[i, j]) for i, j in cells]
+
+
+def correlations_at(z: Sequence[float], size: int) -> tuple[np.ndarray, float]:
+    """The Cholesky factor (p, p) of the correlation matrix whose partial correlations, of row i and
+    column j given the columns before j, are tanh z_ij; and the log Jacobian.
 
     dR = prod_ij cosh(z_ij)^-(p - j) dz (j from 0): Lewandowski, Kurowicka and Joe (2009).
     """
-    cells = lower_half(size)
-
-    def matrix(z: Sequence[float]) -> tuple[np.ndarray, float]:
-        root, log_jacobian, given = np.zeros((size, size)), 0.0, iter(z)
-        for i in range(size):
-            left = 1.0
-            for j in range(i):
-                s = next(given)
-                root[i, j] = left * math.tanh(s)
-                log_cosh = float(np.logaddexp(s, -s)) - math.log(2.0)
-                left *= math.exp(-log_cosh)
-                log_jacobian -= (size - j) * log_cosh
-            root[i, i] = left
-        value = root @ root.T
-        np.fill_diagonal(value, 1.0)
-        kept = _kept(value, np.diagonal(root))
-        return value, log_jacobian if kept else -math.inf
-
-    def at(z: Sequence[float]) -> float:
-        value, log_jacobian = matrix(z)
-        if log_jacobian == -math.inf:
-            return -math.inf
-        return log_density([value[c] for c in cells]) + log_jacobian
-
-    start = free_correlations(symmetric(values, size)).tolist()
-    value, _ = matrix(sweep_real(at, start, [(-math.inf, math.inf)] * len(start), rng))
-    return [value[c] for c in cells]
+    root, log_jacobian, given = np.zeros((size, size)), 0.0, iter(z)
+    for i in range(size):
+        left = 1.0
+        for j in range(i):
+            s = next(given)
+            root[i, j] = left * math.tanh(s)
+            log_cosh = float(np.logaddexp(s, -s)) - math.log(2.0)
+            left *= math.exp(-log_cosh)
+            log_jacobian -= (size - j) * log_cosh
+        root[i, i] = left
+    return root, log_jacobian
 
 
 def _kept(value: np.ndarray, diagonal: np.ndarray) -> bool:

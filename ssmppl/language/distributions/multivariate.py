@@ -135,6 +135,8 @@ class Centred(Joint):
     Cholesky factor, whichever of them was given."""
 
     spread: str  # the name of the matrix
+    centre: ExprArray  # (d,)
+    margins = True  # whether some components alone have the same family
     root: ExprArray | None = None  # of a singular covariance, (d, d); see `covariances.py`
 
     def _set_centre(self, name: str, centre: Any, spreads: dict[str, Any], **others: Any) -> None:
@@ -151,7 +153,7 @@ class Centred(Joint):
                 fix=f"give a {said} of shape (d,) and a matrix of shape (d, d)",
                 where=self.location,
             )
-        self.shape = own.shape
+        self.shape, self.centre = own.shape, own
 
     def whole_matrix(self) -> ExprArray:
         """(d, d) the covariance, or what is like one, however it was given."""
@@ -176,6 +178,11 @@ class Centred(Joint):
         if self.spread == "precision":
             return away @ m @ away, 0.5 * log_determinant(m)
         return away @ inverse(m) @ away, -0.5 * log_determinant(m)
+
+    def of_form(self, square: Any, volume: Any, n: Any) -> Any:
+        """Log density of n of the components, of any if `margins`, given d' C^-1 d and -log det C /
+        2 of their deviations and their part C of the matrix."""
+        raise AttributeError
 
     def guarded_log_densities(self, value):
         density, m = self.log_densities(value), self.parameters[self.spread]
@@ -228,9 +235,11 @@ class MvNormal(Centred):
         return array(np.diagonal(self.whole_matrix().view(np.ndarray)))
 
     def log_densities(self, value):
-        away = array(value) - self.mean_
-        square, volume = self._square_and_volume(away)
-        return array(-0.5 * len(away) * LOG_2PI + volume - 0.5 * square)
+        square, volume = self._square_and_volume(array(value) - self.mean_)
+        return array(self.of_form(square, volume, len(self.mean_)))
+
+    def of_form(self, square, volume, n):
+        return -0.5 * n * LOG_2PI + volume - 0.5 * square
 
     def standard(self, value: Any) -> ExprArray:
         """The standard normal draws (d,) behind a value."""

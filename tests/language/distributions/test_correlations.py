@@ -12,7 +12,7 @@ from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.inference.updates.slices import sweep_correlations
+from ssmppl.inference.updates.slices import correlations_at, sweep_correlations
 from ssmppl.language.distributions import Draws
 from ssmppl.language.model.transforms import free_correlations, transforms
 from ssmppl.language.tracing import trace
@@ -149,6 +149,9 @@ def test_there_and_back_with_the_volume_of_numerical_differences(dim):
     columns = [(back(z + e) - back(z - e))[off] / 2e-6 for e in 1e-6 * np.eye(len(z))]
     found = evaluate(made.log_jacobian, dict(zip(made.free, z, strict=True)))
     assert found == pytest.approx(np.linalg.slogdet(np.array(columns))[1], abs=1e-7)
+    root, log_jacobian = correlations_at(z, dim)  # what slice steps move on
+    np.testing.assert_allclose(root @ root.T, matrix, rtol=0, atol=1e-12)
+    assert log_jacobian == pytest.approx(found, abs=1e-12)
 
 
 @pytest.mark.parametrize("r", [1.0 - 1e-15, 1.0, -1.0, 0.999999])
@@ -160,7 +163,7 @@ def test_correlations_at_the_edge_have_a_finite_place(r):
 
 def test_slice_steps_leave_the_law_as_it_is():
     """Sweeps over draws of the law, one each: the ranks of what comes out are as of the law."""
-    eta, dim, n = 1.3, 3, 1500
+    eta, dim, n = 1.3, 3, 500
     law, rng = ssm.LKJ(dim, eta), np.random.default_rng(4)
     drawn = evaluate(array(law.sample(Draws("x"))), {}, numpy_draws(rng, (n,)))
     cells = [(0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2)]

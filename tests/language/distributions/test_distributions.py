@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats as st
 
+import ssmppl as ssm
 import ssmppl.language.distributions as D
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
@@ -404,3 +405,38 @@ def test_no_labels_of_probabilities_that_do_not_sum_to_one():
     assert found[0] == pytest.approx(math.log(0.4))
     assert np.all(np.isnan(found[1:]))
     assert evaluate(law.in_range()[()], at).tolist() == [1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("spread", ["scale", "precision", "cholesky"])
+def test_a_student_vector_with_holes_has_the_density_of_what_is_there(spread):
+    """The margins of a multivariate Student distribution are such, of the same degrees of
+    freedom."""
+    c = np.array([[2.0, 0.3, -0.2], [0.3, 1.0, 0.4], [-0.2, 0.4, 0.7]])
+    given = {"scale": c, "precision": np.linalg.inv(c), "cholesky": np.linalg.cholesky(c)}[spread]
+    model = ssm.Model("holes")
+    model.prior(lambda: {"m": ssm.Normal(0, sd=3), "df": ssm.Gamma(2, rate=0.1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.5 * x, sd=1)})
+
+    @model.observation
+    def observation(m, df):
+        return {"y": ssm.MvStudentT(df, m, **{spread: given})}
+
+    nan = np.nan
+    y = np.array([[1, 2, 3], [nan, 0.5, 4], [nan, nan, nan], [1, nan, -2], [nan, 9, nan]])
+    expected = 0.0
+    for row in y:
+        there = np.flatnonzero(np.isfinite(row))
+        if len(there):
+            own = st.multivariate_t(np.full(len(there), 0.4), c[np.ix_(there, there)], df=3.5)
+            expected += own.logpdf(row[there])
+    found = ssm.log_likelihood(model, {"y": y}, {"m": 0.4, "df": 3.5}, particles=10, seed=1)
+    assert found[0] == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_constant_beyond_the_support_has_no_density():
+    for law, value in [
+        (D.Uniform(0, 1), -1.0), (D.Beta(2, 2), -0.5), (D.Binomial(5, 0.5), 7.0),
+        (D.Truncated(D.Normal(0, sd=1), lower=0, upper=2), -0.1),
+    ]:  # fmt: skip
+        assert float(evaluate(law.log_density(value))) == -np.inf

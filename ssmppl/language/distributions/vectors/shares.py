@@ -34,6 +34,8 @@ class LogisticNormal(Centred):
     Mean and variance of the shares have no closed form; predictions have NaN for them.
     """
 
+    margins = False
+
     def __init__(
         self, mean: Any, *, covariance: Any = None, precision: Any = None, cholesky: Any = None
     ):

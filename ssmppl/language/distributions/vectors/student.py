@@ -53,12 +53,14 @@ class MvStudentT(Centred):
         self._require("df", 0.0)
 
     def log_densities(self, value):
-        away, nu = array(value) - self.loc, self.df[()]
-        d = len(away)
-        square, volume = self._square_and_volume(away)
-        norm = log_gamma(array(0.5 * (nu + d))) - log_gamma(array(0.5 * nu))
-        norm = norm - 0.5 * d * (math.log(math.pi) + ew("log", nu))
-        return array(norm + volume - 0.5 * (nu + d) * ew("log1p", square / nu))
+        square, volume = self._square_and_volume(array(value) - self.loc)
+        return array(self.of_form(square, volume, len(self.loc)))
+
+    def of_form(self, square, volume, n):
+        nu = self.df[()]
+        norm = log_gamma(array(0.5 * (nu + n))) - log_gamma(array(0.5 * nu))
+        norm = norm - 0.5 * n * (math.log(math.pi) + ew("log", nu))
+        return array(norm + volume - 0.5 * (nu + n) * ew("log1p", square / nu))[()]
 
     def sample(self, draws):
         z = array([draws.normal() for _ in range(len(self.loc))])
