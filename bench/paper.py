@@ -117,7 +117,7 @@ def linear(name: str, c: float) -> Iterator[Row]:
     moments = {"theta": (exact["posterior_mean"], exact["posterior_sd"])}
     for label, method, draws in (
         ("MetropolisHastings", ssm.MetropolisHastings(), 10_000),
-        ("Gibbs", ssm.Gibbs(), 10_000),
+        ("Gibbs", ssm.Gibbs(interweave=False), 10_000),
         ("PMMH", ssm.PMMH(), 5_000),
         ("PGAS, N = 5", ssm.PGAS(particles=5), 10_000),
     ):

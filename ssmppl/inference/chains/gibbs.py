@@ -172,6 +172,5 @@ METHOD = SamplingMethod(
     prepare,
     state_classes=(GibbsState, InterweavingTuning, Pilot),
     by_row=lambda method: method.log_likelihood,
-    where_slow=", or another method, such as ssm.MetropolisHastings()",
     explain=explain,
 )

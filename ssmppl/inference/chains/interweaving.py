@@ -68,6 +68,7 @@ from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.optimisation.newton import climb
 from ssmppl.inference.preparation.exact_models import ExactModel
+from ssmppl.inference.preparation.method_choice import LEAST_WARMUP
 from ssmppl.inference.preparation.pilot import Pilot
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.problem import Problem, joined
@@ -77,7 +78,6 @@ from ssmppl.language.model.transforms import free_number, parameter_bounds, tran
 Paths = list[np.ndarray]
 _NO_GUIDE = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty((0, 0))
 PROPOSALS = 4  # a sweep
-LEAST_WARMUP = 200  # sweeps, below which "auto" has no time to look and to tune
 LOOK = 0.25  # share of the warmup in which "auto" looks at the plain chain
 LONGEST_LOOK = 400  # sweeps
 FEW = 6  # numbers that a random walk moves at once without trouble

@@ -329,5 +329,4 @@ METHOD = SamplingMethod(
     None, drawn, state_classes=(*WALK_STATES, JumpChains, Lane, GaussianPilot, Pilot,
                                 TunedParticles),
     by_row=lambda method: True, trajectories=True,
-    where_slow=", or another method, such as ssm.PMMH()",
 )  # fmt: skip

@@ -186,5 +186,4 @@ METHOD = SamplingMethod(
     prepare,
     state_classes=(*WALK_STATES, LocalProposal, Pilot, Standing),
     by_row=lambda method: method.log_likelihood,
-    where_slow=", or another method, such as ssm.Gibbs()",
 )

@@ -313,6 +313,5 @@ METHOD = SamplingMethod(
     state_classes=(PGASState, InterweavingTuning, EliminationState, PathMovement, Pilot),
     by_row=lambda method: method.log_likelihood,
     attributes=update_rate_attributes,
-    where_slow=", more particles, or another method, such as ssm.PMMH()",
     explain=explain,
 )

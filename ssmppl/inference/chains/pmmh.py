@@ -731,5 +731,4 @@ METHOD = SamplingMethod(
     prepare,
     state_classes=(*WALK_STATES, LocalProposal, Pilot, TunedParticles, Choice, GaussianPilot),
     by_row=lambda method: True,
-    where_slow=', more particles, or another method, such as ssm.PGAS(interweave="auto")',
 )

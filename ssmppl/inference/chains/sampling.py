@@ -116,7 +116,6 @@ class SamplingMethod:
     complete : (settings, draws) -> settings, with what depends on the number of draws.
     by_row : settings -> whether draws come with a log-likelihood of each row.
     attributes : (problem, chains) -> what else goes to the attributes of the result.
-    where_slow : what to try where parameters mix slowly: ", or ...".
     explain : plan -> the rows that `explain` shows, by title.
     """
 
@@ -126,7 +125,6 @@ class SamplingMethod:
     complete: Callable[[Any, int], Any] = lambda settings, draws: settings
     by_row: Callable[[Any], bool] = lambda settings: False
     attributes: Callable[[Problem, DrawnChains], dict[str, Any]] = lambda problem, chains: {}
-    where_slow: str = ""
     explain: Callable[[Derived], Mapping[str, PlanRows]] = lambda plan: {}
     trajectories: bool = False
 
@@ -186,12 +184,6 @@ class SamplingMethod:
         if total > draws:
             report = {**report, "further_draws": total - draws}
         return [_as_asked(c, draws) for c in result], report
-
-    def advice(self, settings: Any) -> str:
-        """What to try, besides more draws, where parameters mix slowly."""
-        if getattr(settings, "interweave", "auto") is False:
-            return f', or ssm.{type(settings).__name__}(interweave="auto")'
-        return self.where_slow
 
 
 def _as_asked(chain: ChainDraws[Any], draws: int) -> ChainDraws[Any]:

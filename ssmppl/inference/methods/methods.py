@@ -83,12 +83,14 @@ class Gibbs:
     Parameters
     ----------
     interweave : whether each sweep also moves the parameters with the states integrated out, by a
-        random walk on the exact likelihood: True, False, or "auto", as in `PGAS`.
+        random walk on the exact likelihood: True; "auto": those that the warmup finds slow, as in
+        `PGAS`, and none where the states take finitely many values; False: none, which is the
+        sampler as it was published.
     log_likelihood : whether to keep log p(y_t | y_1:t-1, theta) of each draw too, exact, in the
         group `log_likelihood`.
     """
 
-    interweave: bool | str = setting(False, flag_or_auto)
+    interweave: bool | str = setting("auto", flag_or_auto)
     log_likelihood: bool = setting(False, flag)
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.proposals.noises import noises
 from ssmppl.analysis.proposals.smooth import smooth_filter_applies
 from ssmppl.analysis.structure import deterministic_memory, noisy_start, singular_covariance
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.batched.extended import Extended
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov
+from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.methods.methods import (
     IF2,
     PGAS,
@@ -18,16 +21,19 @@ from ssmppl.inference.methods.methods import (
     ForwardBackward,
     Gibbs,
     KalmanSmoother,
+    Method,
     MetropolisHastings,
     ScoreAscent,
 )
 from ssmppl.inference.particles.deterministic import Deterministic
-from ssmppl.inference.preparation.exact_models import KIND
+from ssmppl.inference.preparation.exact_models import KIND, exact_kind, exact_model
 from ssmppl.inference.preparation.pilot import TunedParticles
+from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.trace import Trace
 
 ROWS_WITHOUT_ANCESTORS = 100  # over which the particles of PGAS still move all of a trajectory
+LEAST_WARMUP = 200  # sweeps, below which interweave="auto" has no time to look and to tune
 FEW = 6  # numbers that a random walk moves at once without trouble
 
 
@@ -119,7 +125,7 @@ def choose_sampler(
         )
         if kind != "linear Gaussian":
             return Gibbs(), reason
-        return Gibbs(interweave="auto"), (
+        return Gibbs(), (
             f"{reason}; parameters with high autocorrelation in the warmup are also updated with "
             "the states integrated out"
         )
@@ -181,6 +187,52 @@ def start_as_parameter(trace: Trace) -> str:
         f"@prior, ssm.Dirac({name}_first) in @initial) the likelihood is exact, and everything "
         "faster"
     )
+
+
+def what_else(settings: Method, problem: Problem, fixed: Collection[str], sweeps: int) -> str:
+    """What to try, besides more draws, where parameters mix slowly: only what this model can.
+
+    fixed : names of the parameters that are held. sweeps : of the warmup.
+
+    Returns
+    -------
+    str : ", or ..."; empty where there is nothing else.
+    """
+    trace = problem.trace
+    exact, singular = exact_model(trace), singular_covariance(trace)
+    kind = exact_kind(exact)
+    noisy = any(not isinstance(s.distribution, Dirac) for s in trace.transition.values())
+    drawn = singular is None and noisy and kind in (KIND[KalmanModel], KIND[HiddenMarkov])
+    if isinstance(settings, Gibbs | PGAS) and settings.interweave is False:
+        joint = _interweaved(type(settings), problem, fixed, sweeps)
+        if joint:
+            return f", or {joint}"
+    if isinstance(settings, PMMH):
+        flat = any(not s.distribution.proper for s in trace.initial.values())
+        stuck = why_stuck(trace, max(e.steps for e in problem.experiments))
+        if singular is not None or flat or stuck:
+            return ", or more particles"
+        other = _interweaved(PGAS, problem, fixed, sweeps) or "ssm.PGAS()"
+        return f", more particles, or another method, such as {other}"
+    if isinstance(settings, PGAS):
+        return ", more particles, or another method, such as ssm.PMMH()"
+    if isinstance(settings, Gibbs):
+        return ", or another method, such as ssm.MetropolisHastings()"
+    if isinstance(settings, MetropolisHastings):
+        return ", or another method, such as ssm.Gibbs()" if drawn else ""
+    return ", or another method, such as ssm.PMMH()"
+
+
+def _interweaved(
+    kind: type[Gibbs | PGAS], problem: Problem, fixed: Collection[str], sweeps: int
+) -> str:
+    """The method with interweaving, written out; empty where it could move no free parameter."""
+    found = noises(problem.trace, problem.program.missing)
+    finite = exact_kind(exact_model(problem.trace)) == KIND[HiddenMarkov]
+    if isinstance(found, NotApplicable) or finite or not set(found.tied) - set(fixed):
+        return ""
+    longer = f" with warmup={LEAST_WARMUP} or more" if sweeps < LEAST_WARMUP else ""
+    return f'ssm.{kind.__name__}(interweave="auto"){longer}'
 
 
 def choose_maximiser(

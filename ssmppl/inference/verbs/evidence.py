@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import terms
-from ssmppl.arguments import checked
+from ssmppl.arguments import checked_with
 from ssmppl.counts import check_count
 from ssmppl.data import check_values
 from ssmppl.data.notices import noticed
@@ -94,7 +94,7 @@ class Evidence:
         return f"log evidence {self.log_evidence:.4f} (standard error {self.standard_error:.4f})"
 
 
-@checked
+@checked_with((PMMH, MetropolisHastings, SMC2))
 def evidence(
     model: Model,
     data: Any,

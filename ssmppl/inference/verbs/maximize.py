@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.structure import noisy_start
-from ssmppl.arguments import checked
+from ssmppl.arguments import checked_with
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, warn, written_as
 from ssmppl.expressions.expr import symbols_of
@@ -67,7 +67,7 @@ TRAJECTORIES = 1000
 CLIMB = 20  # passes over the data of a climb where a simulator is called, most often
 
 
-@checked
+@checked_with(METHODS)
 def maximize(
     model: Model,
     data: Any,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.structure import singular_covariance
-from ssmppl.arguments import checked
+from ssmppl.arguments import checked_with
 from ssmppl.codegen.store.beforehand import beforehand
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
@@ -38,7 +38,12 @@ from ssmppl.inference.methods.methods import (
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.gaussian_pilot import approximation_kind, precise_twisted
-from ssmppl.inference.preparation.method_choice import choose_sampler, only_counts, why_stuck
+from ssmppl.inference.preparation.method_choice import (
+    choose_sampler,
+    only_counts,
+    what_else,
+    why_stuck,
+)
 from ssmppl.inference.preparation.space import Space, free_components, space_of
 from ssmppl.inference.run.convergence import ESS, convergence_attributes, have_converged
 from ssmppl.inference.run.draws import stack
@@ -73,7 +78,7 @@ METHODS: dict[type, SamplingMethod] = {
 }
 
 
-@checked
+@checked_with(METHODS)
 def sample(
     model: Model,
     data: Any,
@@ -102,16 +107,16 @@ def sample(
         of finitely many states, `ssm.MetropolisHastings(...)` where states have no noise too,
         `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
         `ssm.ISMCMC(...)` for those whose states have a Gaussian approximation.
-        None: for the former Gibbs if every parameter has a closed-form conditional (with
-        `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
-        while the parameters are few; for the others PMMH where a pilot finds that twisted particle
-        filters of at most 64 particles estimate the likelihood precisely (sd of log Z at most 0.3),
-        with up to 12 free numbers; else PGAS, likewise with `interweave="auto"`, or PMMH where no
-        ancestors can be sampled, the data are long or the states counts, and the parameters are
-        few. `explain` and the attributes say which, and why. Chains of a method that was chosen
-        like this, 800 draws of all or more, go on until they have converged (see the attributes
-        below): to at most nine times the draws. The first then count as warmup, and the others are
-        thinned to as many as were asked for; the attribute `further_draws` says how many were made.
+        None: for the former `ssm.Gibbs()` if every parameter has a closed-form conditional, else a
+        random walk on the exact likelihood while the parameters are few; for the others PMMH where
+        a pilot finds that twisted particle filters of at most 64 particles estimate the likelihood
+        precisely (sd of log Z at most 0.3), with up to 12 free numbers; else
+        `ssm.PGAS(interweave="auto")`, or PMMH where no ancestors can be sampled, the data are long
+        or the states counts, and the parameters are few. `explain` and the attributes say which,
+        and why. Chains of a method that was chosen like this, 800 draws of all or more, go on until
+        they have converged (see the attributes below): to at most nine times the draws. The first
+        then count as warmup, and the others are thinned to as many as were asked for; the attribute
+        `further_draws` says how many were made.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
         warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
@@ -240,9 +245,8 @@ def sample(
         symbols = problem.trace.parameter_symbols
         labels = [problem.trace.label(s) for s, f in zip(symbols, free, strict=True) if f]
         theta, interrupted = whole[0]["theta"][:, :, free], bool(attrs["interrupted"])
-        attrs |= convergence_attributes(
-            labels, theta, interrupted, sampling_method.advice(chosen), warmup
-        )
+        advice = what_else(chosen, problem, fixed_values, warmup * thin)
+        attrs |= convergence_attributes(labels, theta, interrupted, advice, warmup)
     return _to_arviz(problem, whole, fixed_values, states, attrs)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ssmppl.arguments import checked
+from ssmppl.arguments import checked_with
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, listing, written_as
@@ -314,7 +314,7 @@ NAMES: dict[str, SmoothingMethod] = {
 }
 
 
-@checked
+@checked_with(METHODS)
 def smooth(
     model: Model,
     data: Any,

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ssmppl.arguments import OF_DISTRIBUTIONS, hint
+from ssmppl.arguments import distribution_hint
 from ssmppl.errors import Location, ModelError, UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, constant, user_location
@@ -580,7 +580,7 @@ def misfit(
     unknown = [k for k in kwargs if k not in (*positional, *by_name)]
     if unknown:
         found = f"{name} has no argument {unknown[0]!r}; given were {given}"
-        fix = hint(unknown[0], [*positional, *by_name], name, OF_DISTRIBUTIONS)
+        fix = distribution_hint(unknown[0], [*positional, *by_name], name)
     elif by_name and len(args) > len(positional):
         found = f"{name} takes its {called} by name: {options}"
         arrays = any(np.ndim(a) for a in args if isinstance(a, np.ndarray))  # print as no Python

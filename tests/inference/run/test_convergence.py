@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.inference.preparation.method_choice import what_else
 from ssmppl.inference.run.convergence import (
     bulk_ess,
     convergence_attributes,
@@ -18,7 +19,7 @@ from ssmppl.inference.run.convergence import (
     unjudged,
 )
 from ssmppl.inference.run.draws import ChainDraws
-from ssmppl.inference.verbs.sample import METHODS
+from ssmppl.inference.run.problem import pose
 from tests.models import standard as models
 
 
@@ -51,10 +52,104 @@ def test_figures_are_those_of_arviz(case: str):
     assert tail_ess(draws) == pytest.approx(float(az.ess(draws, method="tail")), rel=1e-8)
 
 
+SHORT = np.random.default_rng(3).standard_normal(12)
+COUNTS = np.random.default_rng(3).poisson(3.0, 12)
+
+
+walk = ssm.Model("walk")
+walk.prior(lambda: {"q": ssm.InverseGamma(2, scale=0.01), "r": ssm.InverseGamma(2, scale=1)})
+walk.initial(lambda: {"x": ssm.Normal(0, sd=3)})
+walk.transition(lambda x, q: {"x": ssm.Normal(x, variance=q)})
+walk.observation(lambda x, r: {"y": ssm.Normal(x, variance=r)})
+
+
+def else_for(model, method, data=None, fixed=(), warmup=500) -> str:
+    problem = pose(model, {"y": SHORT} if data is None else data)
+    return what_else(method, problem, fixed, warmup)
+
+
+def epidemic() -> ssm.Model:
+    """Its states are counts, without noises that could be held fixed."""
+    model = ssm.Model("epidemic")
+    model.prior(lambda: {"beta": ssm.Gamma(2, rate=2)})
+    model.initial(lambda: {"S": ssm.Poisson(90), "infected": ssm.Poisson(5)})
+    model.transition(
+        lambda S, infected, beta: {
+            "new": ssm.Binomial(S, 1 - np.exp(-beta * infected / 100)),
+            "healed": ssm.Binomial(infected, 0.3),
+        }
+    )
+    model.transition(
+        lambda S, infected, new_next, healed_next: {
+            "S": ssm.Dirac(S - new_next), "infected": ssm.Dirac(infected + new_next - healed_next)
+        }
+    )  # fmt: skip
+    model.observation(lambda infected: {"y": ssm.Poisson(infected + 0.1)})
+    return model
+
+
+def switching() -> ssm.Model:
+    model = ssm.Model("switching")
+    model.prior(lambda: {"p": ssm.Beta(2, 2)})
+    model.initial(lambda: {"k": ssm.Bernoulli(0.5)})
+    model.transition(lambda k, p: {"k": ssm.Bernoulli(np.where(k == 1, p, 1 - p))})
+    model.observation(lambda k: {"y": ssm.Normal(k, sd=1.0)})
+    return model
+
+
+def noiseless() -> ssm.Model:
+    model = ssm.Model("noiseless")
+    model.prior(lambda: {"a": ssm.Normal(0, sd=1)})
+    model.initial(lambda a: {"x": ssm.Dirac(a)})
+    model.transition(lambda x, a: {"x": ssm.Dirac(0.9 * x + a)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    return model
+
+
+@pytest.mark.parametrize(
+    ("model", "method", "data", "fixed", "warmup", "named", "not_named"),
+    [
+        (walk, ssm.PGAS(), None, (), 500, 'ssm.PGAS(interweave="auto")', "warmup"),
+        (walk, ssm.PGAS(), None, (), 50, "with warmup=200 or more", "PMMH"),
+        (walk, ssm.Gibbs(interweave=False), None, (), 500, 'ssm.Gibbs(interweave="a', "M"),
+        (walk, ssm.MetropolisHastings(), None, (), 500, "ssm.Gibbs()", "PGAS"),
+        (epidemic, ssm.PGAS(), COUNTS, (), 500, "ssm.PMMH()", "interweave"),
+        (epidemic, ssm.PMMH(), COUNTS, (), 500, "more particles", "interweave"),
+        (switching, ssm.Gibbs(interweave=False), None, (), 500, "ssm.Metropolis", "interweave"),
+        (noiseless, ssm.MetropolisHastings(), None, (), 500, "", "Gibbs"),
+    ],
+)  # fmt: skip
+def test_only_what_the_model_can_is_advised(
+    model, method, data, fixed, warmup, named, not_named
+):  # fmt: skip
+    model = model if isinstance(model, ssm.Model) else model()
+    data = None if data is None else {"y": data}
+    text = else_for(model, method, data, fixed, warmup)
+    assert named in text
+    assert not_named not in text
+
+
+def test_nothing_is_interweaved_where_what_moves_the_states_is_held():
+    problem = pose(walk, {"y": SHORT})
+    assert "interweave" not in what_else(ssm.PGAS(), problem, problem.trace.parameters, 500)
+
+
+def test_gibbs_is_what_is_chosen_without_a_method():
+    """Draw for draw, interweaving included, on a model with a parameter that is slow without."""
+    y = np.random.default_rng(5).standard_normal(100)
+    settings = {"draws": 50, "warmup": 400, "chains": 1, "seed": 1, "progress": False}
+    chosen = ssm.sample(walk, {"y": y}, **settings)
+    given = ssm.sample(walk, {"y": y}, ssm.Gibbs(), **settings)
+    plain = ssm.sample(walk, {"y": y}, ssm.Gibbs(interweave=False), **settings)
+    assert chosen.attrs["method"] == "Gibbs"
+    assert chosen["sample_stats"]["interweaved"].sum() > 0
+    np.testing.assert_array_equal(chosen["posterior"]["q"], given["posterior"]["q"])
+    assert "interweaved" not in plain["sample_stats"]
+
+
 def warned(draws: np.ndarray, interrupted: bool = False, method=None) -> str:
     labels = [f"p{i}" for i in range(draws.shape[2])]
-    method = ssm.PGAS() if method is None else method
-    advice = METHODS[type(method)].advice(method)
+    advice = else_for(walk, ssm.PGAS() if method is None else method)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         attrs = convergence_attributes(labels, draws, interrupted, advice, 500)

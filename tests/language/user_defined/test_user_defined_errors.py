@@ -108,7 +108,7 @@ def sampler_of_an_unknown_argument():
 
 
 # -- arguments
-@bad("Gumbel has no argument 'scal'", "the arguments of Gumbel are scale, loc")
+@bad("Gumbel has no argument 'scal'", "write scale=")
 def unknown_argument():
     return Gumbel(0.0, scal=1.0)  # HERE
 
