@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from ssmppl.errors import ArgumentError
+from ssmppl.status import call_of
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Kind = TypeVar("Kind", bound=type)
@@ -233,7 +234,8 @@ def _either(options: Sequence[str], word: str = "or") -> str:
 
 def checked_with(methods: Iterable[type]) -> Callable[[Function], Function]:
     """Decorator of a verb: an ArgumentError in place of Python's TypeError where it is called with
-    an argument that it does not have, or without one that it needs.
+    an argument that it does not have, or without one that it needs. What it waits for is told under
+    its name (`status.py`), unless it is called with `progress=False`.
 
     methods : the classes of its methods' settings.
     """
@@ -242,10 +244,14 @@ def checked_with(methods: Iterable[type]) -> Callable[[Function], Function]:
         signature, name = inspect.signature(function), function.__name__
         _VERBS[name] = _Verb(list(signature.parameters), tuple(methods))
 
+        counts = "progress" in signature.parameters
+
         @functools.wraps(function)
         def called(*args: Any, **kwargs: Any) -> Any:
             _check(signature, name, args, kwargs, _verb_hint, name)
-            return function(*args, **kwargs)
+            model = getattr(args[0] if args else kwargs.get("model"), "name", "")
+            with call_of(name, str(model), bool(kwargs.get("progress", True)), counts):
+                return function(*args, **kwargs)
 
         return called  # type: ignore[return-value]
 

@@ -17,8 +17,9 @@ MOST = 12  # modules of a room
 # Each layer and what it may import besides itself. The main chain, in its one direction:
 CHAIN = [
     "errors",
-    "arguments",
     "markup",
+    "status",
+    "arguments",
     "compiling",
     "expressions",
     "language",

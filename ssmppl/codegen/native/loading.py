@@ -5,16 +5,12 @@ same for all models: so a model's own functions are translated to LLVM directly,
 call them by address. What cannot be translated (matrices, the user's primitives) is compiled by
 Numba from the very same text.
 
-Who waits at a terminal for the compiler gets a notice, once in a process, as Numba tells when it
-compiles (`numba.core.event`): verbs that show no progress would else be silent for half a minute
-on the first model of its kind on a machine.
+Who waits for the compiler is told so (`status.py`), as Numba tells when it compiles
+(`numba.core.event`): the first model of its kind on a machine takes half a minute or more.
 """
 
 from __future__ import annotations
 
-import sys
-import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
@@ -22,7 +18,6 @@ from typing import Any
 
 from numba import config
 from numba.core import event
-from tqdm import tqdm
 
 from ssmppl.codegen.kernels.gaussian import mode, unscented
 from ssmppl.codegen.kernels.particle import backward
@@ -34,9 +29,8 @@ from ssmppl.codegen.store import folder
 from ssmppl.codegen.text.callbacks import watched
 from ssmppl.codegen.text.module import ModuleText, Section
 from ssmppl.compiling import LOCK, one_at_a_time
+from ssmppl.status import Compilations
 
-SILENT_SECONDS = 2.0  # of compiling, all together, before the notice
-TEXT = "ssmppl: compiling what this kind of model needs, once; it may take a minute"
 # Specialised functions that kernels call, some of them in place of a model's own.
 HELPERS: dict[str, Any] = {
     name: vars(home)[name]
@@ -51,46 +45,21 @@ HELPERS: dict[str, Any] = {
 }
 
 
-class Notice(event.Listener):
-    """Hears of every compilation, of any thread.
-
-    given : the notice has been given, or is not wanted.
-    """
+class Listener(event.Listener):
+    """Hears of every compilation by Numba, of any thread."""
 
     def __init__(self) -> None:
-        self.given = False
-        self._lock = threading.Lock()
-        self._running, self._spent, self._since = 0, 0.0, 0.0
-        self._timer: threading.Timer | None = None
+        self.compilations = Compilations()
 
     def on_start(self, event: event.Event) -> None:
-        with self._lock:
-            self._running += 1
-            if self._running > 1 or self.given or not (sys.stderr and sys.stderr.isatty()):
-                return
-            self._since = time.monotonic()
-            self._timer = threading.Timer(max(SILENT_SECONDS - self._spent, 0.0), self._tell)
-            self._timer.daemon = True
-            self._timer.start()
+        dispatcher = (event.data or {}).get("dispatcher")
+        self.compilations.began(getattr(getattr(dispatcher, "py_func", None), "__name__", ""))
 
     def on_end(self, event: event.Event) -> None:
-        with self._lock:
-            self._running -= 1
-            if self._running == 0 and self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
-                self._spent += time.monotonic() - self._since
-
-    def _tell(self) -> None:
-        with self._lock:
-            if self.given:
-                return
-            self.given = True
-        tqdm.write(TEXT, file=sys.stderr)
+        self.compilations.ended()
 
 
-notice = Notice()
-event.register("numba:compile", notice)
+event.register("numba:compile", Listener())
 
 
 class Loaded:

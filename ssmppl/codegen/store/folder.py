@@ -167,7 +167,7 @@ def _wait_for(handle: int) -> None:
     if _locked(handle):
         return
     until = time.monotonic() + PATIENCE
-    # A notice is due as if we compiled ourselves.
+    # It is told of as if we compiled ourselves.
     with event.trigger_event("numba:compile", data={"dispatcher": None}):
         while not _locked(handle) and time.monotonic() < until:
             time.sleep(0.02)

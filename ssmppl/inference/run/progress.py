@@ -1,10 +1,10 @@
-"""What a run shows while it goes on: a bar on a terminal, a few lines elsewhere. To stderr."""
+"""What a run shows while it goes on, to stderr: a bar on a terminal and in a notebook, a few lines
+elsewhere."""
 
 from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +13,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ssmppl.codegen.native.loading import notice
+from ssmppl import markup
+from ssmppl.status import Output, clock, kind_of_stderr, terminal_shape, waiting
 
 __all__ = ["Progress", "announced"]
 
@@ -22,9 +23,7 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaini
 # Where there is no terminal: one line for so much of the work done, and seconds since the last.
 SPARSE_SHARE = 0.2
 SPARSE_SECONDS = 5.0
-
-# Work without a bar that takes longer is announced; that on a model compiled before seldom does.
-SILENT_SECONDS = 2.0
+NOTEBOOK_SECONDS = 0.2  # between two states of a notebook's bar
 
 
 class Progress:
@@ -45,9 +44,9 @@ class Progress:
         self._started = self._last_line = time.monotonic()
         self._first: tuple[float, int] | None = None  # when, and how many: code was compiled before
         self._next_share = before / max(total, 1) + SPARSE_SHARE
-        self._lines = shown and not sys.stderr.isatty()
-        self._bar = None
-        if shown and not self._lines:
+        self._bar: Any = None
+        self._kind = kind_of_stderr() if shown else "none"
+        if self._kind == "terminal":
             self._bar = tqdm(
                 total=total,
                 initial=before,
@@ -55,8 +54,9 @@ class Progress:
                 bar_format=BAR,
                 colour=_colour(),
                 file=sys.stderr,
-                **_shape(),
+                **terminal_shape(),
             )
+        self._output = Output() if self._kind == "notebook" else None
 
     def __enter__(self) -> Progress:
         return self
@@ -76,64 +76,54 @@ class Progress:
         if self._bar is not None:
             self._bar.set_postfix_str(note, refresh=False)
             self._bar.update(steps)
-        elif self._lines:
+        elif self._kind != "none":
             self._first = self._first or (time.monotonic(), self.done)
-            self._print_sparsely(note)
+            now = time.monotonic()
+            if self._output is not None:
+                self._show_in_notebook(self._output, now, note)
+            else:
+                self._print_sparsely(now, note)
 
-    def _print_sparsely(self, note: str) -> None:
-        now = time.monotonic()
-        finished = self.done >= self.total
+    def _print_sparsely(self, now: float, note: str) -> None:
         early = self.done < self._next_share * self.total
-        if not finished and (early or now - self._last_line < SPARSE_SECONDS):
+        if self.done < self.total and (early or now - self._last_line < SPARSE_SECONDS):
             return
+        print(self._line(now, note), file=sys.stderr, flush=True)
+        self._last_line = now
+        self._next_share = self.done / self.total + SPARSE_SHARE
+
+    def _show_in_notebook(self, output: Output, now: float, note: str) -> None:
+        if self.done < self.total and now - self._last_line < NOTEBOOK_SECONDS:
+            return
+        self._last_line = now
+        line = self._line(now, note)
+        bar = f"<progress value='{self.done}' max='{self.total}'></progress>"
+        output.show(f"{bar} <code>{markup.text(line)}</code>", line)
+
+    def _line(self, now: float, note: str) -> str:
+        """How far it is, how long it has taken, and will."""
         elapsed = now - self._started
         since, had = self._first or (self._started, self.before)
         if self.done == had:
             since, had = self._started, self.before
         left = (now - since) * (self.total - self.done) / (self.done - had)
-        clock = f"{_clock(elapsed)}<{_clock(left)}" if not finished else _clock(elapsed)
-        parts = [f"{100 * self.done // self.total}%", f"{self.done}/{self.total}", f"[{clock}]"]
-        print(f"{self.title}:", *parts, note, file=sys.stderr, flush=True)
-        self._last_line = now
-        self._next_share = self.done / self.total + SPARSE_SHARE
+        finished = self.done >= self.total
+        time_ = clock(elapsed) if finished else f"{clock(elapsed)}<{clock(left)}"
+        parts = [f"{100 * self.done // self.total}%", f"{self.done}/{self.total}", f"[{time_}]"]
+        return " ".join([f"{self.title}:", *parts, note])
 
 
 @contextmanager
 def announced(title: str, what: str, shown: bool = True) -> Iterator[None]:
     """Say what is going on where it takes long and there is nothing to count."""
-
-    def tell() -> None:
-        print(
-            f"{title}: {what}; a new model is compiled first, once, which may take a minute",
-            file=sys.stderr, flush=True,
-        )  # fmt: skip
-
-    timer = threading.Timer(SILENT_SECONDS, tell)
-    timer.daemon = True
-    if shown:
-        notice.given = True  # by this
-        timer.start()
-    try:
+    if not shown:
         yield
-    finally:
-        timer.cancel()
-
-
-def _shape() -> dict[str, Any]:
-    """Settings of a bar as wide as the terminal, also once that is changed; where it does not tell
-    its size, as within some containers and editors, and no bar would fit, 80 columns."""
-    try:
-        known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
-    except (OSError, ValueError, AttributeError):
-        known = False
-    return {"dynamic_ncols": True} if known else {"ncols": 80, "nrows": 24}
+        return
+    with waiting(title, what):
+        yield
 
 
 def _colour() -> str | None:
     """The colour of the bar; none where NO_COLOR is set, or the terminal has none."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     return None if plain else "cyan"
-
-
-def _clock(seconds: float) -> str:
-    return tqdm.format_interval(int(seconds))

@@ -51,6 +51,7 @@ from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.model import Model
+from ssmppl.status import LOG
 
 # The methods: what climbs under each class of settings.
 METHODS: dict[type, Callable[[Maximization, Any], Ascent]] = {
@@ -138,6 +139,10 @@ def maximize(
         ascent = Ascent(space.theta, None, space.theta[None], {"converged": True})
     else:
         chosen, reason = (method, "by the user") if method is not None else choose_method(setup)
+        if method is None:
+            LOG.info(
+                "maximize of model %r: %s, as %s", problem.trace.name, type(chosen).__name__, reason
+            )
         ascent = METHODS[type(chosen)](setup, chosen)
         if method is None and ascent.report.get("approximate") and not ascent.interrupted:
             setup, chosen, reason = _without_laplace(setup, ascent)

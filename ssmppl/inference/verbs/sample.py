@@ -61,6 +61,7 @@ from ssmppl.inference.updates.independence import AHEAD, PREPARING
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.transforms import transforms
 from ssmppl.results import to_inference_data
+from ssmppl.status import LOG
 
 # Draws of all chains without which these do not go on: what is left of them when they are thinned
 # has an ESS of 400 for certain only if there is room.
@@ -186,6 +187,8 @@ def sample(
         passes = PREPARING + chains * (draws * thin / AHEAD) * (1 + states)
         reckon("sample", problem, space.theta, passes, progress)
     chosen, reason = (method, "") if method is not None else _chosen(space, fixed_values)
+    if method is None:
+        LOG.info("sample of model %r: %s, as %s", problem.trace.name, type(chosen).__name__, reason)
     sampling_method = METHODS.get(type(chosen))
     if sampling_method is None:
         names = ", ".join(f"ssm.{m.__name__}(...)" for m in METHODS)

@@ -57,6 +57,7 @@ from ssmppl.inference.verbs.filters import LEVELS, normal_quantiles, quantile_le
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
 from ssmppl.results import to_dataset
+from ssmppl.status import LOG
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -420,6 +421,7 @@ def _kind(method: Any) -> type | None:
 def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
     if method is None:
         chosen, why = choose_smoother(exact_kind(exact_model(problem.trace)), problem.trace)
+        LOG.info("smooth of model %r: %s, as %s", problem.trace.name, type(chosen).__name__, why)
         return chosen, f"automatically: {why}"
     if isinstance(method, str):
         if method not in NAMES:
