@@ -22,6 +22,7 @@ from ssmppl.expressions.expr import user_location
 from ssmppl.language.model.closure_digest import digest_of_code, fingerprint, plain_function
 from ssmppl.language.model.component_names import ComponentNames
 from ssmppl.language.model.executions import Execution, this_execution
+from ssmppl.language.model.pickling import reduced
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
 TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}  # in seconds
@@ -273,6 +274,20 @@ class Model:
 
     def __getstate__(self) -> dict[str, Any]:  # no other process runs this one's cells again
         return self.__dict__ | {"_executions": {}, "_outdated": {}}
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        functions = (f for of_role in self.functions.values() for f in of_role)
+        return reduced(self, self.__getstate__(), functions)
+
+    def __copy__(self) -> Model:
+        """A model of its own, with the same functions: what is declared of it is its own."""
+        made = type(self).__new__(type(self))
+        functions = {role: list(of_role) for role, of_role in self.functions.items()}
+        made.__dict__.update(self.__getstate__() | {"functions": functions})
+        return made
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Model:
+        return self.__copy__()
 
     def _declare(self, role: str, function: Law) -> Law:
         if not (inspect.isfunction(function) or inspect.ismethod(function)):

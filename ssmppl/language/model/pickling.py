@@ -1,4 +1,4 @@
-"""What is sent to other processes: pickled once here, unpickled once there.
+"""What is sent to other processes: pickled once here, unpickled once there; and models in pickles.
 
 A model's distributions do not travel: what is sent is the trace, the expressions that they gave. Of
 the user's functions only those travel that are called for every particle, `@ssm.primitive`, and
@@ -7,13 +7,16 @@ those that `diagnose` tries, `@ssm.effect`.
 
 from __future__ import annotations
 
+import copyreg
 import hashlib
 import pickle
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
+
+from ssmppl.errors import Location, ModelError
 
 try:
     import cloudpickle
@@ -59,6 +62,55 @@ def holder_of(function: Callable[..., Any]) -> Any:
     if module == "__main__" and getattr(_own, "by_value", False):
         return None
     return getattr(sys.modules.get(module), function.__qualname__, None)
+
+
+def reduced(thing: Any, state: dict[str, Any], functions: Iterable[Callable[..., Any]]) -> Any:
+    """What `pickle` writes of something that holds a user's functions: `__reduce_ex__`.
+
+    Functions that another process finds by their names go by these, as `pickle` sends all. Others
+    (lambdas, functions of a notebook, a script or another function, and several of one name) are
+    sent themselves, by cloudpickle.
+
+    Raises
+    ------
+    ModelError : there is such a function and no cloudpickle; names it.
+    """
+    inside = getattr(_own, "reducing", False)  # a function of it refers to the thing itself
+    own = [f for f in functions if inside or not _found_by_name(f)]
+    if inside or not own:
+        return copyreg.__newobj__, (type(thing),), state  # type: ignore[attr-defined]
+    if cloudpickle is None:
+        if all(_found_by_name(f, script=True) for f in own):  # where the same script is run
+            return copyreg.__newobj__, (type(thing),), state  # type: ignore[attr-defined]
+        code = own[0].__code__
+        raise ModelError(
+            f"a model cannot be pickled with {own[0].__qualname__!r}, which has no name that "
+            "another process would find it by",
+            fix="pip install cloudpickle, with which it can; or define the model's functions by "
+            "def, under different names, at the top level of a module",
+            where=Location(code.co_filename, code.co_firstlineno, own[0].__name__),
+        )
+    _own.reducing = True
+    try:
+        return _rebuilt, (type(thing), packed(state))
+    finally:
+        _own.reducing = False
+
+
+def _rebuilt(kind: type[Thing], content: bytes) -> Thing:
+    made = kind.__new__(kind)
+    made.__dict__.update(unpacked(content))
+    return made
+
+
+def _found_by_name(function: Callable[..., Any], script: bool = False) -> bool:
+    """script : whether the names of the script that runs count."""
+    found: Any = sys.modules.get(function.__module__)
+    if function.__module__ == "__main__" and not script:
+        return False
+    for name in function.__qualname__.split("."):
+        found = getattr(found, name, None)
+    return found is function
 
 
 class UnpackedCache(Generic[Thing]):
