@@ -86,15 +86,19 @@ def bind(
     return [_bind(trace, s, need_observations, steps, common) for s in given]
 
 
-def unread(trace: Trace, data: Any) -> list[str]:
-    """The columns that neither are named as an observation or input of the model nor begin with
-    such a name and `[` or `_`, as the components of vectors do."""
+def unread(trace: Trace, data: Any) -> dict[str, Any]:
+    """The columns, with what the first data set has in them, that neither are named as an
+    observation or input of the model nor begin with such a name and `[` or `_`, as the components
+    of vectors do."""
     named = [*trace.observations, *trace.inputs]
-    columns = dict.fromkeys(
-        str(c) for s in sources(data, named, by=trace.experiment) for c in s.columns
-    )
+    columns = dict[str, Any]()
+    for source in sources(data, named, by=trace.experiment):
+        columns = {str(c): values for c, values in source.columns.items()} | columns
     parts = tuple(f"{n}{mark}" for n in named for mark in "[_")
-    return [c for c in columns if c not in (*named, "time") and not c.startswith(parts)]
+    return {
+        c: values for c, values in columns.items()
+        if c not in (*named, "time") and not c.startswith(parts)
+    }  # fmt: skip
 
 
 def bind_inputs(

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data.binding import Experiment, unread
-from ssmppl.data.times import spacing, trading_days
-from ssmppl.errors import warn
+from ssmppl.data.times import as_dates, spacing, trading_days
+from ssmppl.errors import DataError, warn
 from ssmppl.language.checks.ranges import beyond_range
 from ssmppl.language.model.trace import Trace
 
 OF_TIME = re.compile(
     r"(?i)(.*_)?(date|time|datetime|timestamp|day|week|month|quarter|year)s?(_.*)?"
 )
-
+FIRST = 20  # entries of a column that tell whether it holds dates
 
 _noticed: ContextVar[bool] = ContextVar("noticed", default=False)
 
@@ -44,11 +44,26 @@ def warn_of(trace: Trace, data: Any, experiments: Sequence[Experiment]) -> None:
     for text in found:
         warn(text)
     if all(e.time is None for e in experiments):
-        for column in filter(OF_TIME.fullmatch, unread(trace, data)):
+        for column, values in unread(trace, data).items():
+            if not (OF_TIME.fullmatch(column) or _are_dates(values)):
+                continue
             warn(
                 f"the column {column!r} is not used, and rows have numbers: call it `time` to "
                 "label them, by which absent rows are noticed"
             )
+
+
+def _are_dates(values: Any) -> bool:
+    """By the first entries of a column; dates too that are written in more than one order."""
+    try:
+        if np.asarray(values).dtype.kind == "M":
+            return True
+        entries = np.asarray(values, dtype=object)[:FIRST]
+        return as_dates(entries, "", "") is not None
+    except DataError:
+        return True
+    except (TypeError, ValueError, IndexError):
+        return False
 
 
 def _steps(trace: Trace, experiments: Sequence[Experiment]) -> list[str]:

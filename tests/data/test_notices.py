@@ -62,6 +62,12 @@ CASES = {
     ),
     "nothing in a column": (table(z=np.nan), ["z: missing in every row"]),
     "dates that nobody reads": (table(date=DATES), ["the column 'date' is not used"]),
+    "dates under another name": (table(Datum=DATES), ["the column 'Datum' is not used"]),
+    "dates as text": (table(when=DATES.astype(str)), ["the column 'when' is not used"]),
+    "the day first": (table(when=DATES.strftime("%d.%m.%Y")), ["the column 'when' is not used"]),
+    "dates of Python": (table(when=DATES.date), ["the column 'when' is not used"]),
+    "a mapping": ({"y": Y, "z": Y, "when": DATES.values}, ["the column 'when' is not used"]),
+    "names": (table(station="Potsdam", ward=np.arange(12).astype(str)), []),
     "dates beside others": (table(time=DATES, month=DATES), []),
     "another column": (table(updates=1.0), []),
 }

@@ -343,7 +343,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         rows = max(e.steps for e in experiments)
         bound = ", ".join(f"{e.steps} rows" for e in experiments)
         bound += f", {gaps} missing" if gaps else ", none missing"
-        labels = _labels(traced, experiments) + _unread(unread(traced, data), experiments)
+        labels = _labels(traced, experiments) + _unread([*unread(traced, data)], experiments)
     program = compile_trace(traced, missing)
     nonlinear = isinstance(exact_model(traced), NotApplicable)
     return Plan(
