@@ -87,6 +87,7 @@ from ssmppl.language.distributions import (
     Wishart,
     ZeroInflated,
 )
+from ssmppl.language.model import model as _model
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
@@ -239,6 +240,14 @@ __all__ = [
 
 # Decorators that a model has.
 _OF_A_MODEL = ("prior", "initial", "transition", "observation", "proposal")
+
+
+def _svg(model: Model) -> str:
+    found: str = importlib.import_module(f"{__name__}.plots.model").svg_of(model)
+    return found
+
+
+_model.draw = _svg
 
 
 def __getattr__(name: str) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +25,7 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.verbs.explain import Plan, explain
 from ssmppl.language.model.model import Model
+from ssmppl.language.tracing import trace
 from ssmppl.plots.drawing import styled
 
 __all__ = ["plot_model"]
@@ -30,6 +33,8 @@ __all__ = ["plot_model"]
 ROOM, GAP = 0.72, 0.5  # inches of a node's height, and between parameters and the rows
 WIDTH = 8.0
 IN_A_ROW = 5  # parameters
+MOST_IN_A_NOTEBOOK = 40  # quantities
+SHOWN = 560  # pixels of the picture's width there, at most
 COLUMNS = {BEFORE: 0.12, STATE: 0.5, OBSERVED: 0.88}
 EXACT = {
     "linear Gaussian": "exact: Kalman filter",
@@ -76,6 +81,36 @@ def plot_model(model: Model, *, graphviz: bool = False, ax: Any = None) -> Any:
     return _drawn(graph, plan, ax)
 
 
+def svg_of(model: Model) -> str:
+    """The picture as SVG, to stand in the HTML of a notebook; empty of a model of so many
+    quantities that it could not be read there.
+
+    Raises
+    ------
+    ModelError : the model is not complete.
+    ImportError : there is no Matplotlib.
+    """
+    graph = model_graph(trace(model))
+    if len(graph.nodes) > MOST_IN_A_NOTEBOOK:
+        return ""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    # Text stays text, and names within the picture are the same each time.
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": model.name}):
+        figure = Figure(figsize=(WIDTH, _height(graph)), layout="constrained")
+        _drawn(graph, explain(model), figure.subplots())
+        out = io.StringIO()
+        figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
+    text = out.getvalue()
+    text = text[text.index("<svg") :]  # without what only a file of its own begins with
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    head, _, rest = text.partition(">")
+    head = re.sub(r' (?:width|height)="[^"]*"', "", head)
+    colour = "background:white;color:black"  # the picture's, on dark pages too
+    return f'{head} style="max-width:{SHOWN}px;width:100%;{colour}">{rest}'
+
+
 # -- words
 def derived_of(plan: Plan) -> dict[str, str]:
     """How each parameter is drawn by Gibbs samplers."""
@@ -107,6 +142,14 @@ def _text(node: Node, derived: Mapping[str, str]) -> str:
 
 
 # -- by Matplotlib
+def _height(graph: ModelGraph) -> float:
+    """In inches."""
+    lines = -(-len(graph.of_role(PARAMETER)) // IN_A_ROW)
+    before = len(graph.of_role(BEFORE)) + len(graph.of_role(INPUT))
+    high = max(before, len(graph.of_role(STATE)), len(graph.of_role(OBSERVED)))
+    return ROOM * (lines + high) + GAP * bool(lines) + 0.6
+
+
 @styled
 def _drawn(graph: ModelGraph, plan: Plan, ax: Any) -> Any:
     parameters, inputs = graph.of_role(PARAMETER), graph.of_role(INPUT)
@@ -114,7 +157,7 @@ def _drawn(graph: ModelGraph, plan: Plan, ax: Any) -> Any:
     columns[BEFORE] = columns[BEFORE] + inputs
     lines = -(-len(parameters) // IN_A_ROW)
     high = max(map(len, columns.values()))
-    height = ROOM * (lines + high) + GAP * bool(lines) + 0.6
+    height = _height(graph)
     if ax is None:
         from matplotlib import pyplot
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+import re
+import warnings
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.analysis.model_graph import Edge, model_graph
+from ssmppl.language.model import model as model_module
 from ssmppl.language.tracing import trace
 from ssmppl.plots.model import dot_text
 
@@ -145,3 +148,85 @@ def test_graphviz_gets_the_same_picture(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ssm.ArgumentError, match="pip install graphviz"):
         ssm.plot_model(epidemic(), graphviz=True)
+
+
+def shown(model) -> str:
+    return model._repr_html_()
+
+
+def test_a_notebook_shows_the_picture():
+    html = shown(epidemic())
+    picture = html[html.index("<svg") : html.index("</svg>")]
+    for word in ("beta", "LogNormal", "count", "computed", "of each town"):
+        assert f">{word}" in picture or f"{word}<" in picture
+    assert not re.findall(r"(?:href|src)=.(?!#)|<script|url\((?!#)", picture)  # asks for nothing
+    assert "<table" in html
+    assert html == shown(epidemic())  # also the names within it
+    assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize("fault", ["raises", "is not linear", "exits", "warns"])
+def test_showing_a_faulty_model_never_fails(fault):
+    def transition(x):
+        if fault == "raises":
+            return {"x": ssm.Normal(x, sd=1.0 / 0.0)}
+        if fault == "is not linear":
+            return {"x": ssm.Normal(x, sd=1.0) if x > 0 else ssm.Normal(0, sd=1)}
+        if fault == "exits":
+            raise RecursionError("too deep")
+        warnings.warn("odd", stacklevel=1)
+        return {"x": ssm.Normal(x, sd=1.0)}
+
+    model = ssm.Model("faulty")
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(transition)
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        html = shown(model)
+    assert "<table" in html
+    assert ("<svg" in html) is (fault == "warns")
+
+
+def test_a_model_that_is_not_complete_is_not_run():
+    calls = []
+    model = ssm.Model("begun")
+    model.prior(lambda: calls.append(1) or {"a": ssm.Normal(0, sd=1)})
+    model.initial(lambda a: {"x": ssm.Normal(a, sd=1)})
+    assert "<svg" not in shown(model)
+    assert calls == []
+
+
+def test_a_picture_is_drawn_once_and_again_after_a_change(monkeypatch):
+    drawings = []
+    draw = model_module.draw
+    monkeypatch.setattr(model_module, "draw", lambda m: drawings.append(1) or draw(m))
+    model = epidemic()
+    assert shown(model) == shown(model)
+    assert len(drawings) == 1
+    model.observation(lambda x: {"late": ssm.Normal(x, sd=2)})
+    assert ">late" in shown(model)
+    assert len(drawings) == 2
+
+
+def test_without_matplotlib_and_of_many_quantities_there_is_none(monkeypatch):
+    many = ssm.Model("many")
+    names = [f"x{i}" for i in range(20)]
+    many.initial(lambda: {n: ssm.Normal(0, sd=1) for n in names})
+    for n in names:
+        space = {"ssm": ssm}
+        exec(f"def move({n}): return {{'{n}': ssm.Normal({n}, sd=1)}}", space)
+        many.transition(space["move"])
+    many.observation(lambda x0: {"y": ssm.Normal(x0, sd=1)})
+    assert "<svg" not in shown(many)
+    load = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.partition(".")[0] == "matplotlib":
+            raise ImportError(name)
+        return load(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    html = shown(epidemic())
+    assert "<table" in html
+    assert "<svg" not in html

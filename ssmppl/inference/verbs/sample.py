@@ -67,6 +67,9 @@ from ssmppl.status import LOG
 # has an ESS of 400 for certain only if there is room.
 LEAST_TO_GO_ON = 2 * ESS
 TRIED_OUT = 4  # draws, and as many before them
+# The name of the log-likelihoods of rows. Not a channel's: with that, ArviZ would weigh the draws
+# of `predict` at a row, which know the whole record, by densities of one-step predictions.
+ONE_STEP = "one_step"
 FEW_SETS = 2  # what passes over several data sets need is compiled for two as for any number
 # The methods, under the classes of their settings.
 METHODS: dict[type, SamplingMethod] = {
@@ -150,12 +153,13 @@ def sample(
           the draw; ISMCMC: likewise, with the approximation's, and the weight by which the draw was
           resampled in place of acceptance_rate) or update_rate and
           ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
-        * log_likelihood (PMMH; ISMCMC; Gibbs, MetropolisHastings and PGAS by their setting
-          `log_likelihood=True`): log p(y_t | y_1:t-1, theta) of the rows that were measured, along
-          `time`, of several experiments with different rows along `row`. `az.loo` and `az.compare`
-          take each row's for that of an observation given all others, which it is not: what they
-          print is the score of one-step predictions with parameters that know the row itself, less
-          a correction for that, and says little of rows to come. `ssm.leave_future_out` does;
+        * log_likelihood (`one_step`; PMMH; ISMCMC; Gibbs, MetropolisHastings and PGAS by their
+          setting `log_likelihood=True`): log p(y_t | y_1:t-1, theta) of the rows that were
+          measured, along `time`, of several experiments with different rows along `row`. `az.loo`
+          and `az.compare` take each row's for that of an observation given all others, which it is
+          not: what they print is the score of one-step predictions with parameters that know the
+          row itself, less a correction for that, and says little of rows to come.
+          `ssm.leave_future_out` does;
         * observed_data, constant_data (inputs).
 
         Attributes name method, settings, seed, versions, the plan, and the time taken; after PGAS
@@ -352,7 +356,7 @@ def _to_arviz(
         sample_stats=stats,
         observed_data=labels.together([e.observed for e in problem.experiments]),
         constant_data=labels.together([e.inputs for e in problem.experiments]) or None,
-        log_likelihood={"y": found[0]} if found else None,
+        log_likelihood={ONE_STEP: found[0]} if found else None,
         rows=found[1] if found else None,
         over_time=paths,
         **labels.arguments,

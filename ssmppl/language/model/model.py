@@ -28,6 +28,7 @@ Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
 TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}  # in seconds
 _MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python's
 ROLES = ("prior", "initial", "transition", "observation", "proposal")
+NEEDED = ("initial", "transition", "observation")
 VERBS = ("compile", "diagnose", "evidence", "explain", "forecast", "forward_filter",
          "kalman_filter", "leave_future_out", "log_likelihood", "maximize", "particle_filter",
          "plot_likelihood", "predict", "sample", "score", "simulate", "smooth")  # fmt: skip
@@ -38,6 +39,8 @@ _OTHER_NAMES = {  # decorators of other libraries
     **dict.fromkeys(("parameters", "params", "priors"), "prior"),
     "importance": "proposal",
 }
+# Draws a model as SVG; the package sets it, as pictures stand above the language.
+draw: Callable[[Any], str] | None = None
 
 
 class Model:
@@ -144,6 +147,7 @@ class Model:
         self.per_experiment: set[Callable[..., Any]] = set()  # priors of each experiment's own
         self._executions: dict[Callable[..., Any], Execution] = {}  # in which each was declared
         self._outdated: dict[tuple[str, str], Callable[..., Any]] = {}  # by role and name
+        self._shown: tuple[Any, str] | None = None  # the picture, and of what
 
     def _checked_time_step(self, name: str | None, unit: str) -> tuple[str, str] | None:
         if name is not None and not (isinstance(name, str) and name.isidentifier()):
@@ -273,7 +277,7 @@ class Model:
         raise UnknownName(f"a model has no {name!r}", fix=fix, where=user_location())
 
     def __getstate__(self) -> dict[str, Any]:  # no other process runs this one's cells again
-        return self.__dict__ | {"_executions": {}, "_outdated": {}}
+        return self.__dict__ | {"_executions": {}, "_outdated": {}, "_shown": None}
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         functions = (f for of_role in self.functions.values() for f in of_role)
@@ -372,8 +376,8 @@ class Model:
         return f"<Model {self.name!r}{inputs}: {declared or 'nothing declared'}>"
 
     def _repr_html_(self) -> str:
-        """What was declared, where, on what each distribution depends, and the functions as they
-        stand."""
+        """A picture of the model, what was declared, where, on what each distribution depends, and
+        the functions as they stand."""
         rows, texts = [], []
         for role in ROLES:
             for function in self.functions[role]:
@@ -388,13 +392,29 @@ class Model:
         if not rows:
             return markup.heading(self.name) + markup.paragraph("Nothing is declared yet.")
         head = ("law", "depends on", "declared at")
-        found = markup.heading(self.name) + markup.table(rows, head, left=(0, 1, 2))
+        found = markup.heading(self.name) + self._picture()
+        found += markup.table(rows, head, left=(0, 1, 2))
         source = "\n\n".join(t for t in texts if t)
         style = "text-align:left"
         if source:
             inside = f"<pre style='{style}'>{markup.text(source)}</pre>"
             found += markup.folded("the functions", inside)
         return found
+
+    def _picture(self) -> str:
+        """As SVG; empty where there is none, as of a model that is not complete or has a fault:
+        showing a model never fails."""
+        if draw is None or not all(self.functions[r] for r in NEEDED):
+            return ""
+        key = self.signature
+        if self._shown is None or self._shown[0] != key:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    self._shown = key, draw(self)
+            except Exception:  # of the user's functions as well
+                self._shown = key, ""
+        return self._shown[1]
 
 
 def _source(function: Callable[..., Any]) -> str:

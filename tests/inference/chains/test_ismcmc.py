@@ -96,8 +96,8 @@ def test_draws_do_not_depend_on_the_executor_and_repeat_states_with_parameters()
     stats = one["sample_stats"]
     exact, approximate = "log_marginal_likelihood", "approximate_log_marginal_likelihood"
     assert set(stats) == {"lp", exact, approximate, "weight"}
-    assert one["log_likelihood"]["y"].shape == (2, 60, 40)
-    sums = one["log_likelihood"]["y"].sum("time" if "time" in one["log_likelihood"].dims else None)
+    assert one["log_likelihood"]["one_step"].shape == (2, 60, 40)
+    sums = one["log_likelihood"]["one_step"].sum("time" if "time" in one["log_likelihood"].dims else None)
     np.testing.assert_allclose(sums, stats[exact])
 
 

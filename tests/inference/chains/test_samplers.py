@@ -93,7 +93,7 @@ def test_vectors_matrices_inputs_gaps_and_experiments(method):
     if not getattr(method, "order", 0) and not getattr(method, "correlation", 0):
         return
     seen = [np.isfinite(np.asarray(e["y"])).any(axis=1).sum() for e in EXPERIMENTS]
-    assert one["log_likelihood"]["y"].shape == (2, 12, sum(seen))
+    assert one["log_likelihood"]["one_step"].shape == (2, 12, sum(seen))
 
 
 nonlinear = ssm.Model("nonlinear")

@@ -134,14 +134,14 @@ def test_rows_sum_up_to_the_exact_likelihood_of_the_draw(case):
         np.testing.assert_array_equal(drawn, asked["posterior"][name])
     assert "log_likelihood" not in plain
     rows = asked["log_likelihood"]
-    assert rows["y"].dims == ("chain", "draw", "row")
+    assert rows["one_step"].dims == ("chain", "draw", "row")
     assert rows["experiment"].values.tolist() == [1] * (ROWS - 1) + [2] * (ROWS - 1)
     times = [t for t in range(1, ROWS + 1) if t != 6]  # nothing was measured then
     assert rows["time"].values.tolist() == 2 * times
     for draw in (0, 19):
         theta = {n: float(asked["posterior"][n][1, draw]) for n in model_parameters(model)}
         for i, record in enumerate(records):
-            own = rows["y"].values[1, draw, rows["experiment"].values == i + 1]
+            own = rows["one_step"].values[1, draw, rows["experiment"].values == i + 1]
             exact = ssm.log_likelihood(model, record, theta, proposal=proposal)
             np.testing.assert_allclose(float(own.sum()), float(np.ravel(exact)[0]), rtol=1e-6)
 

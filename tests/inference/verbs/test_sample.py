@@ -63,7 +63,7 @@ def test_groups_and_shapes(method):
     assert attrs["interrupted"] == 0
     assert attrs["seconds"] > 0
     if isinstance(method, ssm.PMMH):
-        per_step = idata["log_likelihood"]["y"].sum("time")
+        per_step = idata["log_likelihood"]["one_step"].sum("time")
         np.testing.assert_allclose(
             per_step, idata["sample_stats"]["log_marginal_likelihood"], rtol=1e-9
         )
@@ -73,7 +73,7 @@ def test_predictive_densities_after_pgas_on_request():
     plain = ssm.sample(walk, DATA, ssm.PGAS(particles=10), seed=3, **SHORT)
     asked = ssm.sample(walk, DATA, ssm.PGAS(particles=10, log_likelihood=True), seed=3, **SHORT)
     np.testing.assert_array_equal(plain["posterior"]["q"], asked["posterior"]["q"])
-    values = asked["log_likelihood"]["y"]
+    values = asked["log_likelihood"]["one_step"]
     assert values.shape == (2, 20, 40)
     at = {n: asked["posterior"][n].values[0, 0] for n in ("b", "q", "p")}
     reference = ssm.particle_filter(walk, DATA, at, particles=20_000, seed=1)
