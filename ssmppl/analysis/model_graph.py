@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.language.distributions import Dirac
+from ssmppl.language.model.covariances import together
 from ssmppl.language.model.trace import Site, Trace
 
 # Roles of nodes, and of symbols that stand for them in a distribution.
@@ -58,6 +59,7 @@ class ModelGraph:
 
 def model_graph(trace: Trace) -> ModelGraph:
     """The graph of one row of a traced model, and of what it reads of the row before."""
+    trace = together(trace)
     nodes = [_node(PARAMETER, s) for s in trace.parameters.values()]
     nodes += [Node(INPUT, name) for name in trace.inputs]
     edges: list[Edge] = []

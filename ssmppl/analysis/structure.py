@@ -24,6 +24,7 @@ from ssmppl.expressions.expr import (
     topological,
 )
 from ssmppl.language.distributions import Dirac, Flat, MvNormal, Normal
+from ssmppl.language.model.covariances import noiseless
 from ssmppl.language.model.trace import Site, Trace, once_per_trace, previous
 
 
@@ -300,10 +301,14 @@ def singular_covariance(trace: Trace) -> NotApplicable | None:
     singular whatever the parameters are, or in some cases of the conditions in it."""
     for role, sites in (("initial distribution", trace.initial), ("transition", trace.transition)):
         for site in sites.values():
-            if isinstance(site.distribution, MvNormal) and site.distribution.root is not None:
-                rank = sum(any(e is not constant(0.0) for e in column)
-                           for column in site.distribution.root.view(np.ndarray).T)  # fmt: skip
+            root = site.distribution.root if isinstance(site.distribution, MvNormal) else None
+            still = noiseless(site.distribution)
+            if root is not None or still:
+                columns = root.view(np.ndarray).T if root is not None else ()
                 full = site.shape[0]
+                rank = full - len(still)
+                if len(columns):
+                    rank = sum(any(e is not constant(0.0) for e in own) for own in columns)
                 how = f"(rank {rank} of {full})" if rank < full else "in some cases"
                 return NotApplicable(
                     f"the covariance in the {role} of {site.name} is singular {how}, so "

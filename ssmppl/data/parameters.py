@@ -17,6 +17,7 @@ from ssmppl.data.values import (
     without_unit_diagonal,
 )
 from ssmppl.errors import ArgumentError, listing
+from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model.trace import Site, Trace
 
@@ -142,32 +143,40 @@ def _check_supports(trace: Trace, values: Mapping[str, np.ndarray], argument: st
 
 def pack(sites: Iterable[Site], values: Mapping[str, np.ndarray]) -> np.ndarray:
     """Values (..., *shape) by name as one array (..., number of distinct symbols)."""
-    columns = [values[s.name][(..., *c.data[2])] for s in sites for c in s.components]
+    return _pack({s.name: s.value for s in sites}, values)
+
+
+def _pack(of: Mapping[str, ExprArray], values: Mapping[str, np.ndarray]) -> np.ndarray:
+    columns = [
+        values[n][(..., *c.data[2])] for n, v in of.items() for c in dict.fromkeys(v.ravel())
+    ]
     return np.stack(columns, axis=-1).astype(np.float64) if columns else np.zeros(0)
 
 
 def unpack(sites: Iterable[Site], packed: np.ndarray) -> dict[str, np.ndarray]:
     """The reverse of `pack`: name -> (..., *shape), symmetric matrices filled on both sides."""
-    sites = list(sites)
+    return _unpack({s.name: s.value for s in sites}, packed)
+
+
+def _unpack(of: Mapping[str, ExprArray], packed: np.ndarray) -> dict[str, np.ndarray]:
     position: dict[Expr, int] = {}
-    for site in sites:
-        for symbol in site.components:
+    for value in of.values():
+        for symbol in dict.fromkeys(value.ravel()):
             position[symbol] = len(position)
     on_disk = isinstance(packed, np.memmap)
     packed = np.asarray(packed)
     if packed.ndim == 0 or packed.shape[-1] != len(position):
         raise ArgumentError(
             f"an array of shape {packed.shape} for {len(position)} components",
-            fix=f"its last axis must have length {len(position)}: "
-            f"{', '.join(s.name for s in sites) or 'none'}",
+            fix=f"its last axis must have length {len(position)}: {', '.join(of) or 'none'}",
         )
     out = {}
-    for site in sites:
-        columns = np.array([position[s] for s in site.value.ravel()], dtype=np.intp)
+    for name, value in of.items():
+        columns = np.array([position[s] for s in value.ravel()], dtype=np.intp)
         taken: slice | np.ndarray = columns
         if on_disk and np.array_equal(columns, np.arange(len(columns)) + columns[0]):
             taken = slice(int(columns[0]), int(columns[0]) + len(columns))  # stays there
-        out[site.name] = packed[..., taken].reshape(packed.shape[:-1] + site.shape)
+        out[name] = packed[..., taken].reshape(packed.shape[:-1] + value.shape)
     return out
 
 
@@ -189,7 +198,7 @@ def unpack_states(trace: Trace, x: np.ndarray, started: bool = True) -> dict[str
     started : the first of the T rows is that of the data, to which no step has led: draws of a step
         are NaN there.
     """
-    out = unpack(trace.initial.values(), x)
+    out = _unpack(trace.states, x)
     if started:
         first: tuple[Any, ...] = (*(slice(None),) * (np.ndim(x) - 2), 0)
         for name in trace.auxiliary:
@@ -200,13 +209,13 @@ def unpack_states(trace: Trace, x: np.ndarray, started: bool = True) -> dict[str
 
 def pack_states(trace: Trace, values: Mapping[str, np.ndarray]) -> np.ndarray:
     """The reverse of `unpack_states`."""
-    known = {n: values[n] for n in trace.initial}
+    known = {n: values[n] for n in trace.states}
     for name in trace.auxiliary:
-        axis = np.ndim(known[name]) - len(trace.initial[name].shape) - 1
+        axis = np.ndim(known[name]) - trace.states[name].ndim - 1
         first: tuple[Any, ...] = (*(slice(None),) * axis, 0)
         known[name] = np.array(known[name])
         known[name][first] = 0.0
-    return pack(trace.initial.values(), known)
+    return _pack(trace.states, known)
 
 
 def unpack_observations(trace: Trace, y: np.ndarray) -> dict[str, np.ndarray]:
@@ -223,7 +232,7 @@ def _plural(word: str, names: list[str]) -> str:
 
 
 def _role(trace: Trace, name: object) -> str:
-    for role, sites in (("a state", trace.initial), ("an observation", trace.observations),
+    for role, sites in (("a state", trace.states), ("an observation", trace.observations),
                         ("an input", trace.inputs)):  # fmt: skip
         if name in sites:
             return f"{role}, no parameter"

@@ -55,6 +55,7 @@ from ssmppl.diagnosis.selection.effect_selection import (
 )
 from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.errors import ArgumentError, SSMError, listing
+from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.progress import announced
@@ -156,9 +157,10 @@ class _Diagnosis:
     ):  # fmt: skip
         self.failures, self.horizon = failures, horizon
         self.began = time.perf_counter()
-        self.problem = pose(model, data, noting=True)
+        self.problem = pose(model, data, noting=True, whole=True)
         self.trace = self.problem.trace
         check_samplers(self.trace)
+        need_density(self.trace, "the diagnosis", "diagnose")
         self.experiments = self.problem.experiments
         self.fixed = check_values(self.trace, fixed, argument="fixed")
         self.effects, self.mode, self.alpha = effects, mode, alpha

@@ -34,7 +34,7 @@ from ssmppl.language.checks.rules import (
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.distributions.vectors.correlations import with_unit_diagonal
 from ssmppl.language.model.calling import call, call_once, check_outer_names, return_location
-from ssmppl.language.model.covariances import find_root, independent
+from ssmppl.language.model.covariances import by_noise, find_root, independent, noiseless
 from ssmppl.language.model.model import Model, location_of
 from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Site, Trace, symbols
 from ssmppl.language.user_defined.sde import noises, started
@@ -84,6 +84,26 @@ def trace(model: Model, experiments: tuple[Any, ...] = ()) -> Trace:
 def _kept(model: Model, signature: tuple, experiments: tuple[Any, ...]) -> Trace | None:
     known = _traces.get(model)
     return known[1].get(experiments) if known is not None and known[0] == signature else None
+
+
+def _by_noise(sites: Mapping[str, Site], proposal: Mapping[str, Site]) -> dict[str, Site]:
+    """States with components that have noise and such that have none in two sites, unless there is
+    a proposal of the whole."""
+    parts = [[s] if s.name in proposal else by_noise(s) for s in sites.values()]
+    return {site.name: site for own in parts for site in own}
+
+
+def _no_noise(name: str, law: Distribution, role: str) -> ModelError:
+    k = noiseless(law)[0]
+    fix = "give it a variance, or leave the component out; only states may be without noise"
+    if role == "proposal":
+        fix = "leave @proposal out, and one is derived"
+    return ModelError(
+        f"the covariance of {name!r} in @{role} has a row of zeros, that of component {k}: such a "
+        "component has no density",
+        fix=fix,
+        where=law.location,
+    )
 
 
 class _Redefined(Exception):
@@ -147,8 +167,8 @@ class _Tracer:
         traced = Trace(
             name=model.name,
             parameters=parameters,
-            initial=initial,
-            transition=self.new.ordered(initial, transition),
+            initial=_by_noise(initial, proposal),
+            transition=_by_noise(self.new.ordered(initial, transition), proposal),
             observations=observations,
             proposal=proposal,
             inputs=dict(model.inputs) | ({EXPERIMENT_NUMBER: ()} if several else {}),
@@ -189,6 +209,8 @@ class _Tracer:
                     distribution = self._of_each(name, distribution, line)
                 if function_role in ("initial", "transition"):
                     find_root(distribution)
+                elif noiseless(distribution):
+                    raise _no_noise(name, distribution, function_role)
                 if name in sites:
                     if self.model._forgets(function_role, givers[name], function):
                         raise _Redefined

@@ -205,10 +205,12 @@ def test_ranks():
         found = singular_covariance(trace(model))
         return "" if found is None else found.reason
 
-    a, b = np.array([0.0, 1.0, 2.0]), np.array([0.0, -1.0, 1.0])
+    a, b = np.array([0.5, 1.0, 2.0]), np.array([0.0, -1.0, 1.0])
     assert "rank 1 of 3" in rank(lambda q, s: q * np.outer(a, a) + s * np.outer(2 * a, a))
     assert "rank 2 of 3" in rank(lambda q, s: q * np.outer(a, a) + s * np.outer(b, b))
     assert not rank(lambda q, s: q * np.outer(a, a) + s * np.eye(3))
+    # a component without noise is a site of its own
+    assert "rank 1 of 2" in rank(lambda q, s: (q + s) * np.outer(b, b))
     assert not rank(lambda q, s: q * np.outer(a, a) + s * 1e-6 * np.eye(3))
 
 

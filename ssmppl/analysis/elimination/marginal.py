@@ -113,7 +113,7 @@ class _Build:
         initial = self._sites(trace.initial, None)
         transition = in_order(self._sites(trace.transition, filtered))
         if transition is None:
-            first = trace.transition[self.split.linear[0].data[1]].distribution
+            first = trace.law_of(self.split.linear[0]).distribution
             reason = (
                 "states that move with the linear ones, and others, read each other's new values"
             )

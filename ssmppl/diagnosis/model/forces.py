@@ -151,8 +151,8 @@ def _noise_in(force: Force, trace: Trace) -> Expr | None:
     noisy = [
         s
         for s in inside
-        if not isinstance(trace.transition[s.data[1]].distribution, Dirac)
-        and scale_of_mean(trace.transition[s.data[1]].distribution) == "identity"
+        if not isinstance(trace.law_of(s).distribution, Dirac)
+        and scale_of_mean(trace.law_of(s).distribution) == "identity"
     ]
     if len(noisy) != 1 or not isinstance(_law_of(force.rate, trace), Dirac):
         return None

@@ -113,7 +113,7 @@ def start_of(trace: Trace, flat: tuple[int, ...], model: Matrices, experiment: E
     factor, right = diffuse_filter(model, flat, experiment, increments)
     for j, i in enumerate(flat):
         if factor[j, j] == 0.0:
-            site = trace.initial[trace.state_symbols[i].data[1]]
+            site = trace.law_of(trace.state_symbols[i], "initial")
             raise SamplingError(
                 f"the start of {trace.state_symbols[i]!r} is Flat, and the data do not tell it "
                 "(together with the components that are Flat before it)",

@@ -25,9 +25,12 @@ def need_density(trace: Trace, method: str, verb: str) -> None:
     if reason is None:
         return
     linear = not isinstance(linear_gaussian(trace), NotApplicable)
+    written = "write components that follow without a noise of their own as states of distribution "
+    written += "ssm.Dirac"
+    if verb in WITHOUT:
+        written = f"use {WITHOUT[verb][0 if linear else 1]}, which needs none; or {written}"
     raise ArgumentError(
         f"{method} needs the density of the states: {reason.reason}",
-        fix=f"use {WITHOUT[verb][0 if linear else 1]}, which needs none; or write components that "
-        "follow without a noise of their own as states of distribution ssm.Dirac",
+        fix=written,
         where=reason.where,
     )

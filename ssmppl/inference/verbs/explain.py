@@ -261,8 +261,8 @@ def _laws(sites: dict[str, Site], told: Mapping[str, str] | None = None) -> list
     rows = []
     for s in sites.values():
         rows.append((s.name, _cut(f"~ {s.distribution!r}")))
-        if told and s.name in told:
-            rows.append(("", told[s.name]))
+        if told and s.quantity in told:
+            rows.append(("", told[s.quantity]))
         if s.distribution.approximation:
             rows.append(("", s.distribution.approximation))
     return rows

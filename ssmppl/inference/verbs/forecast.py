@@ -299,7 +299,7 @@ def _at_known(
 
     def one(i: int) -> _Past:
         e, own, trace = problem.experiments[i], found[i], problem.trace
-        paths = pack_states(trace, {name: own[name].values for name in trace.initial})
+        paths = pack_states(trace, {name: own[name].values for name in trace.states})
         theta = np.tile(check_parameters(trace, parameters), (n, 1))
         time = np.arange(1, e.steps + 1) if e.time is None else e.time
         told = {

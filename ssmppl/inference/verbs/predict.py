@@ -101,11 +101,11 @@ def states_of(trace: Trace, posterior: Any) -> np.ndarray | None:
     """(chain, draw, T, D) trajectories of a single experiment (`experiments_of`); None where they
     were not kept."""
     values: Mapping[str, Any] = {
-        name: _drawn(posterior, name, site.shape, ("time",))
-        for name, site in trace.initial.items()
+        name: _drawn(posterior, name, value.shape, ("time",))
+        for name, value in trace.states.items()
         if name in posterior and "time" in posterior[name].dims
     }
-    if len(values) < len(trace.initial):
+    if len(values) < len(trace.states):
         return None
     return pack_states(trace, values)
 

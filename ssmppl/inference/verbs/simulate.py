@@ -153,9 +153,10 @@ def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) ->
                 place = {c: i for i, c in enumerate(order)}
                 at_fault = np.flatnonzero(np.isnan(values[draw, t]))
                 k = min(at_fault, key=lambda i: place[symbols[i]])
-            site = (traced.initial if t == 0 and sites is traced.transition else sites)[
-                symbols[k].data[1]
-            ]
+            if sites is traced.transition:
+                site = traced.law_of(symbols[k], "transition" if t else "initial")
+            else:
+                site = sites[symbols[k].data[1]]
             now = traced.state_symbols if t or sites is traced.observations else []
             before = traced.state_prev_symbols if t else []
             known = dict(zip(now, states[draw, t], strict=False))

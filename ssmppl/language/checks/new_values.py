@@ -18,6 +18,7 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.checks.rules import a
 from ssmppl.language.distributions import Dirac
+from ssmppl.language.model.covariances import noiseless
 from ssmppl.language.model.model import location_of
 from ssmppl.language.model.trace import Site
 
@@ -46,6 +47,10 @@ class NewValues:
         value = site.value
         if isinstance(site.distribution, Dirac):
             value = array(np.broadcast_to(array(site.distribution.mean()), site.shape))
+        elif fixed := list(noiseless(site.distribution)):
+            mixed = np.array(value.view(np.ndarray))
+            mixed[fixed] = list(array(site.distribution.mean())[fixed])
+            value = array(mixed)
         self.given[site.name] = value
 
     def value(self, argument: str, where: Location) -> Expr | ExprArray | None:

@@ -79,6 +79,10 @@ def checked_matrix(law: Distribution, name: str) -> ExprArray:
 
 def _check_numbers(law: Distribution, name: str, m: ExprArray) -> None:
     numbers = np.array([e.data for e in m.ravel()]).reshape(m.shape)
+    if name == "covariance":  # components without noise, which states may have
+        noisy = np.any(numbers != 0.0, axis=0) | np.any(numbers != 0.0, axis=1)
+        if noisy.any():
+            numbers = numbers[np.ix_(noisy, noisy)]
     lower = name == "cholesky"
     symmetric = lower or np.allclose(numbers, numbers.T, rtol=1e-10, atol=0)
     positive = (
@@ -207,9 +211,11 @@ class MvNormal(Centred):
     ----------
     mean : shape (d,), or one number for all components.
     covariance, precision, cholesky : exactly one of them, (d, d): the covariance, its inverse, or
-        its lower factor L with L L' = covariance. As the distribution of states a covariance may be
-        singular, as q G G' is, for all values of its symbols or in some cases of the conditions in
-        it: methods that need no density of the transition take it.
+        its lower factor L with L L' = covariance. As the distribution of states a covariance may
+        have rows and columns of zeros, as that of a companion form has: these components follow
+        without noise, as of `Dirac`. It may also be singular otherwise, as q G G' is, for all
+        values of its symbols or in some cases of the conditions in it: methods that need no density
+        of the transition take it.
     """
 
     gaussian_noise = True

@@ -1,6 +1,8 @@
 """What the covariance of a traced MvNormal is made of: independent components, or too few noises.
 
 One with zeros off its diagonal is a Normal distribution of each component, and is taken as such.
+One with rows of zeros, as of a companion form, is taken apart (`by_noise`): components with noise,
+of a covariance of their own, and those that follow without any.
 One whose rank is less than its size (q G G', one noise that drives several states) has no density;
 draws need a root of it, found by the Cholesky recursion in the given order, whose pivots of zero
 leave columns of zeros (Higham 2002, "Accuracy and stability of numerical algorithms", section
@@ -12,6 +14,7 @@ beyond.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +24,9 @@ from ssmppl.expressions.expr import Expr, constant
 from ssmppl.expressions.test_points import PLAIN, TestPoints, moderate, numbers_at, wide, with_cases
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.distributions.continuous import Normal
+from ssmppl.language.distributions.discrete import Dirac
 from ssmppl.language.distributions.multivariate import MvNormal
+from ssmppl.language.model.trace import Site, Trace
 
 ZERO = 1e-10  # of the variances: what is zero in floating point
 AGREE = 1e-8  # of the variances: what a root may differ by
@@ -42,6 +47,91 @@ def independent(law: Distribution) -> Distribution:
     normal = Normal(law.mean_, **spread)  # type: ignore[arg-type]
     normal.location, normal.approximation = law.location, law.approximation
     return normal
+
+
+def noiseless(law: Distribution) -> tuple[int, ...]:
+    """The components of an MvNormal distribution whose variance is zero whatever the values of its
+    symbols are."""
+    if not isinstance(law, MvNormal) or law.spread != "covariance":
+        return ()
+    matrix, zero = law.parameters["covariance"].view(np.ndarray), constant(0.0)
+    return tuple(i for i, row in enumerate(matrix) if all(e is zero for e in row))
+
+
+def by_noise(site: Site) -> list[Site]:
+    """A site of states taken apart into what has noise and what has none; itself where there is
+    nothing to part.
+
+    The density of the whole is that of the components with noise: the others follow.
+    """
+    law, fixed = site.distribution, noiseless(site.distribution)
+    if not fixed:
+        return [site]
+    assert isinstance(law, MvNormal)
+    noisy = [i for i in range(len(law.mean_)) if i not in fixed]
+    out = []
+    for index in (noisy, list(fixed)):
+        if not index:
+            continue
+        own: Distribution = Dirac(array(law.mean_[index]))
+        if index is noisy:
+            matrix = law.parameters["covariance"].view(np.ndarray)[np.ix_(noisy, noisy)]
+            own = independent(_placed(MvNormal(law.mean_[noisy], covariance=array(matrix)), law))
+            find_root(own)
+        name = f"{site.name}[{_indexes(index)}]" if len(fixed) < len(law.mean_) else site.name
+        value = array(site.value[index])
+        out.append(Site(name, site.role, _placed(own, law), value, site.where))
+    return out
+
+
+def together(trace: Trace) -> Trace:
+    """The trace with every state under one distribution, as it was declared: `by_noise` undone."""
+    initial, transition = _whole(trace.initial), _whole(trace.transition)
+    if initial is trace.initial and transition is trace.transition:
+        return trace
+    return replace(trace, initial=initial, transition=transition)
+
+
+def _whole(sites: dict[str, Site]) -> dict[str, Site]:
+    """The sites of one role, each quantity in one."""
+    groups: dict[str, list[Site]] = {}
+    for site in sites.values():
+        groups.setdefault(site.quantity, []).append(site)
+    if len(groups) == len(sites):
+        return sites
+    return {name: own[0] if len(own) == 1 else _joined(name, own) for name, own in groups.items()}
+
+
+def _joined(name: str, sites: list[Site]) -> Site:
+    n, first = sum(len(s.value) for s in sites), sites[0]
+    zero = constant(0.0)
+    mean, matrix = np.full(n, zero, dtype=object), np.full((n, n), zero, dtype=object)
+    value = np.empty(n, dtype=object)
+    for site in sites:
+        law = site.distribution
+        at = [s.data[2][0] for s in site.value]
+        value[at], mean[at] = list(site.value), list(array(law.mean()))
+        if isinstance(law, MvNormal):
+            matrix[np.ix_(at, at)] = law.covariance_matrix().view(np.ndarray)
+        elif isinstance(law, Normal):
+            matrix[at, at] = list(array(law.variance_in_range()))
+    law = _placed(MvNormal(array(mean), covariance=array(matrix)), first.distribution)
+    find_root(law)
+    return Site(name, first.role, law, array(value), first.where)
+
+
+def _placed(law: Distribution, like: Distribution) -> Distribution:
+    law.location, law.approximation = like.location, like.approximation
+    return law
+
+
+def _indexes(index: list[int]) -> str:
+    """Of a vector, as NumPy takes them."""
+    if len(index) == 1:
+        return str(index[0])
+    if index == list(range(index[0], index[-1] + 1)):
+        return f"{index[0]}:{index[-1] + 1}"
+    return str(index)
 
 
 def find_root(law: Distribution) -> None:

@@ -43,7 +43,8 @@ class Site:
     """One named quantity under one distribution.
 
     value : the symbols of the quantity, of the distribution's shape (symmetric matrices share
-        the symbols of their lower half).
+        the symbols of their lower half). Components of a vector of states with noise and without
+        are two sites, `x[0:2]` and `x[2:5]`, in the initial distribution and in the transition.
     """
 
     name: str
@@ -55,6 +56,12 @@ class Site:
     @property
     def shape(self) -> tuple[int, ...]:
         return self.value.shape
+
+    @property
+    def quantity(self) -> str:
+        """The name of what the site is of: its own, unless it holds some components only."""
+        name: str = self.value.ravel()[0].data[1]
+        return name
 
     @cached_property
     def components(self) -> list[Expr]:
@@ -111,8 +118,26 @@ class Trace:
         return [s for site in self.parameters.values() for s in site.components]
 
     @cached_property
+    def states(self) -> dict[str, ExprArray]:
+        """The symbols of every state by its name, of its shape, in whatever sites they are."""
+        groups: dict[str, list[Site]] = {}
+        for site in self.initial.values():
+            groups.setdefault(site.quantity, []).append(site)
+        return {
+            name: own[0].value
+            if len(own) == 1
+            else symbols(own[0].role, name, (sum(len(s.value) for s in own),))
+            for name, own in groups.items()
+        }
+
+    @cached_property
     def state_symbols(self) -> list[Expr]:
-        return [s for site in self.initial.values() for s in site.components]
+        return [s for value in self.states.values() for s in dict.fromkeys(value.ravel())]
+
+    def law_of(self, s: Expr, role: str = "transition") -> Site:
+        """The site that holds a component of a state. role : "transition" or "initial"."""
+        sites: dict[str, Site] = getattr(self, role)
+        return next(site for site in sites.values() if s in set(site.components))
 
     @cached_property
     def state_prev_symbols(self) -> list[Expr]:
