@@ -97,7 +97,7 @@ from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.tables import summary
 
 if TYPE_CHECKING:
-    from ssmppl import plots, simulators
+    from ssmppl import plots, simulators, structural
     from ssmppl.diagnosis.diagnose import diagnose
     from ssmppl.diagnosis.effects.catalogue import effects
     from ssmppl.diagnosis.effects.effect import effect
@@ -116,7 +116,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = ("plots", "simulators")
+_MODULES = ("plots", "simulators", "structural")
 _LATER = {
     "GapReport": "diagnosis.report.report",
     "diagnose": "diagnosis.diagnose",
@@ -234,6 +234,7 @@ __all__ = [
     "simulator",
     "simulators",
     "smooth",
+    "structural",
     "summary",
 ]
 

@@ -115,10 +115,10 @@ def decorator_with_parentheses():
         return {}
 
 
-@bad("a second @initial function; the first is at", "return all states from one @initial")
+@bad("'x' is given by two @initial functions; the other is at", "give each quantity one")
 def second_initial():
     def again():  # HERE
-        return {"z": ssm.Normal(0, sd=1)}
+        return {"x": ssm.Normal(0, sd=1)}
 
     return declare(initial=[GOOD["initial"], again])
 

@@ -35,10 +35,11 @@ ALLOWED["tables"] = {"errors", "results"}
 ALLOWED["datasets"] = {"errors"}
 # ... and serve what follows. Adapters make simulators of the language.
 ALLOWED["simulators"] = {"errors", "expressions", "language"}
+ALLOWED["structural"] = {"compiling", "errors", "expressions", "language"}
 ALLOWED["inference"] = {*CHAIN, "counts", "data", "results"}
 ALLOWED["drawing"] = {"errors", "data"}
 ALLOWED["diagnosis"] = ALLOWED["inference"] | {"inference", "drawing"}
-ALLOWED["plots"] = ALLOWED["diagnosis"] | {"diagnosis", "tables"}
+ALLOWED["plots"] = ALLOWED["diagnosis"] | {"diagnosis", "structural", "tables"}
 # What the command line is made of: the demonstration, written as a user would, and files read.
 ALLOWED["demo"] = {PACKAGE, "datasets", "results"}
 ALLOWED["modelfile"] = {"data", "errors", "language"}

@@ -325,7 +325,7 @@ _given: ContextVar[Location | None] = ContextVar("given", default=None)
 # Frames of these folders are never where the user wrote it.
 _OWN = tuple(
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
-    for d in ("expressions", "language", "simulators")
+    for d in ("expressions", "language", "simulators", "structural")
 )
 _OWN += tuple(  # SciPy lies beside NumPy
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(np.__file__))), d) + os.sep

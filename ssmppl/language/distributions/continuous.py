@@ -335,6 +335,11 @@ class Flat(Distribution):
     def __init__(self, shape: tuple[int, ...] = ()):
         self._set(zero=np.zeros(shape))
 
+    def __repr__(self) -> str:
+        shape = ", ".join(map(str, self.shape))
+        text = shape if len(self.shape) == 1 else f"({shape})"
+        return f"{type(self).__name__}({f'shape={text}' if self.shape else ''})"
+
     def rebuilt(self, parameters):
         return self
 

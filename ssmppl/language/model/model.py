@@ -23,6 +23,7 @@ from ssmppl.language.model.closure_digest import digest_of_code, fingerprint, pl
 from ssmppl.language.model.component_names import ComponentNames
 from ssmppl.language.model.executions import Execution, this_execution
 from ssmppl.language.model.pickling import reduced
+from ssmppl.language.written import Written, written
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
 TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}  # in seconds
@@ -148,6 +149,7 @@ class Model:
         self._executions: dict[Callable[..., Any], Execution] = {}  # in which each was declared
         self._outdated: dict[tuple[str, str], Callable[..., Any]] = {}  # by role and name
         self._shown: tuple[Any, str] | None = None  # the picture, and of what
+        self.components: dict[str, Any] = {}  # of ssm.structural, by name
 
     def _checked_time_step(self, name: str | None, unit: str) -> tuple[str, str] | None:
         if name is not None and not (isinstance(name, str) and name.isidentifier()):
@@ -277,17 +279,27 @@ class Model:
         raise UnknownName(f"a model has no {name!r}", fix=fix, where=user_location())
 
     def __getstate__(self) -> dict[str, Any]:  # no other process runs this one's cells again
-        return self.__dict__ | {"_executions": {}, "_outdated": {}, "_shown": None}
+        functions = {r: [written(f) or f for f in fs] for r, fs in self.functions.items()}
+        fresh = {"_executions": {}, "_outdated": {}, "_shown": None}
+        return self.__dict__ | {"functions": functions} | fresh
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.functions = {
+            r: [f.function() if isinstance(f, Written) else f for f in fs]
+            for r, fs in self.functions.items()
+        }
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        functions = (f for of_role in self.functions.values() for f in of_role)
-        return reduced(self, self.__getstate__(), functions)
+        own = (f for fs in self.functions.values() for f in fs if not written(f))
+        return reduced(self, self.__getstate__(), own)
 
     def __copy__(self) -> Model:
         """A model of its own, with the same functions: what is declared of it is its own."""
         made = type(self).__new__(type(self))
-        functions = {role: list(of_role) for role, of_role in self.functions.items()}
-        made.__dict__.update(self.__getstate__() | {"functions": functions})
+        made.__dict__.update(self.__getstate__())
+        made.functions = {role: list(of_role) for role, of_role in self.functions.items()}
+        made.per_experiment, made.components = set(self.per_experiment), dict(self.components)
         return made
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Model:
@@ -305,9 +317,8 @@ class Model:
                 fix=f"write @model.{role} (without parentheses) on the line above a def",
                 where=user_location(),
             )
-        now = this_execution()
-        self._forget(lambda role, old, then: now.outdates(then))
-        if role in ("initial", "proposal") and self.functions[role]:
+        now = self.begin()
+        if role == "proposal" and self.functions[role]:
             first = self.functions[role][0]
             if not self._forgets(role, first, function, now):
                 raise ModelError(
@@ -320,6 +331,13 @@ class Model:
         self._executions[function] = now
         self._note_change(role, function)
         return function
+
+    def begin(self) -> Execution:
+        """The run of a cell or a module that declares something now; what an earlier run of the
+        same has declared is forgotten."""
+        now = this_execution()
+        self._forget(lambda role, old, then: now.outdates(then))
+        return now
 
     def _forgets(
         self, role: str, old: Callable[..., Any], new: Callable[..., Any],

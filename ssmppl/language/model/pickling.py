@@ -99,7 +99,7 @@ def reduced(thing: Any, state: dict[str, Any], functions: Iterable[Callable[...,
 
 def _rebuilt(kind: type[Thing], content: bytes) -> Thing:
     made = kind.__new__(kind)
-    made.__dict__.update(unpacked(content))
+    made.__setstate__(unpacked(content))  # type: ignore[attr-defined]
     return made
 
 
