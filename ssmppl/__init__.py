@@ -104,6 +104,7 @@ if TYPE_CHECKING:
     from ssmppl.diagnosis.report.report import GapReport
     from ssmppl.plots import (
         plot_ancestry,
+        plot_components,
         plot_filter,
         plot_forecast,
         plot_likelihood,
@@ -123,6 +124,7 @@ _LATER = {
     "effect": "diagnosis.effects.effect",
     "effects": "diagnosis.effects.catalogue",
     "plot_ancestry": "plots.filters",
+    "plot_components": "plots.structure",
     "plot_filter": "plots.filters",
     "plot_forecast": "plots.states",
     "plot_likelihood": "plots.likelihood",
@@ -216,6 +218,7 @@ __all__ = [
     "maximize",
     "particle_filter",
     "plot_ancestry",
+    "plot_components",
     "plot_filter",
     "plot_forecast",
     "plot_likelihood",

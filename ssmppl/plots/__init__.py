@@ -8,6 +8,7 @@
     predictions.py  plot_predictions
     parameters.py   plot_prior_posterior, plot_maximization
     model.py        plot_model
+    structure.py    plot_components
     likelihood.py   plot_likelihood
 
 The panels of a report of `diagnose` are under these names too; they stand in
@@ -33,11 +34,11 @@ from ssmppl.plots.model import plot_model
 from ssmppl.plots.parameters import plot_maximization, plot_prior_posterior
 from ssmppl.plots.predictions import plot_predictions
 from ssmppl.plots.states import plot_forecast, plot_states
+from ssmppl.plots.structure import plot_components
 
 __all__ = [
     "free_run", "gap_closed", "missing_term", "page", "panel_figures", "pictures", "plot",
-    "plot_ancestry", "plot_filter", "plot_forecast", "plot_likelihood", "plot_maximization",
-    "plot_model",
-    "plot_predictions", "plot_prior_posterior", "plot_states", "ranked_effects", "residual_map",
+    "plot_ancestry", "plot_components", "plot_filter", "plot_forecast", "plot_likelihood",
+    "plot_maximization", "plot_model", "plot_predictions", "plot_prior_posterior", "plot_states", "ranked_effects", "residual_map",
     "save", "separating_signal",
 ]  # fmt: skip

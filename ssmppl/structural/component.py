@@ -26,10 +26,13 @@ class Component:
     """A part of a structural model: what the functions in this module return.
 
     name : by which the model, `observe` and `plot_components` know it.
-    kind : "level", "trend", "seasonal", "cycle", "regression", "intervention", "autoregression".
+    kind : "level", "trend", "seasonal", "cycle", "regression", "intervention", "autoregression";
+        of a sum that is observed, "observation".
     states, parameters, inputs : their names.
     value : what it adds to the mean of an observation, as Python in these names (and `t`).
     text : its functions, as they stand in the model.
+    diffuse : whether a state of it has a flat start. reads_time : whether `value` reads `t`.
+    link : of an observation, the scale of its mean on which `value` is: "identity", "log", "logit".
     """
 
     name: str
@@ -41,6 +44,7 @@ class Component:
     text: str
     diffuse: bool = False
     reads_time: bool = False
+    link: str = ""
 
     @property
     def arguments(self) -> tuple[str, ...]:
@@ -239,6 +243,16 @@ def present(model: Model) -> dict[str, Component]:
     return dict(model.components)
 
 
+def components_of(model: Model) -> dict[str, Component]:
+    """Those of them that can be summed up."""
+    return {n: c for n, c in present(model).items() if c.kind != "observation"}
+
+
+def observations_of(model: Model) -> dict[str, Component]:
+    """The sums of components that are observed, by channel."""
+    return {n: c for n, c in present(model).items() if c.kind == "observation"}
+
+
 def _function_names(text: str) -> list[str]:
     return [line[4:].split("(")[0] for line in text.splitlines() if line.startswith("def ")]
 
@@ -353,7 +367,7 @@ def check_components(model: Model, components: Sequence[Any], kind: str) -> list
     ------
     ArgumentError : there is none, or one is not of this model.
     """
-    known, found = present(model), []
+    known, found = components_of(model), []
     for c in components:
         name = c.name if isinstance(c, Component) else c
         own = known.get(name) if isinstance(name, str) else None

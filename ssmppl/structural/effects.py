@@ -77,7 +77,7 @@ def regression(
     for n in names:
         own, shape = f"{n}_coefficient", w.model.inputs[n]
         size = shape[0] if shape else None
-        terms.append(f"{own} @ {n}" if shape else f"{own} * {n}")
+        terms.append(f"sum({own} * {n})" if shape else f"{own} * {n}")
         start = w.start("coefficients", coefficients, size)
         if not random_walk:
             w.priors[own] = start

@@ -17,18 +17,21 @@ from ssmppl.structural.component import (
 )
 
 # Of each distribution: its law, and its parameters beside the mean, with their default priors.
-LAWS: dict[str, tuple[str, dict[str, str]]] = {
-    "normal": ("ssm.Normal({mean}, sd={sd})", {"sd": "ssm.HalfFlat()"}),
+# link : the scale on which the components are summed.
+LAWS: dict[str, tuple[str, str, dict[str, str]]] = {
+    "normal": ("identity", "ssm.Normal({mean}, sd={sd})", {"sd": "ssm.HalfFlat()"}),
     "student_t": (
+        "identity",
         "ssm.StudentT({df}, {mean}, scale={sd})",
         {"df": "ssm.Gamma(2, rate=0.1)", "sd": "ssm.HalfFlat()"},
     ),
-    "poisson": ("ssm.Poisson(np.exp({mean}))", {}),
+    "poisson": ("log", "ssm.Poisson(np.exp({mean}))", {}),
     "negative_binomial": (
+        "log",
         "ssm.NegativeBinomial(np.exp({mean}), dispersion={dispersion})",
         {"dispersion": "ssm.Gamma(2, rate=0.1)"},
     ),
-    "bernoulli": ("ssm.Bernoulli(1 / (1 + np.exp(-({mean}))))", {}),
+    "bernoulli": ("logit", "ssm.Bernoulli(1 / (1 + np.exp(-({mean}))))", {}),
 }
 
 
@@ -71,7 +74,7 @@ def observe(
             "distribution", distribution, f"give one of: {', '.join(map(repr, LAWS))}; or write "
             "an @observation function of your own, which names the states of the components",
         )  # fmt: skip
-    law, priors = LAWS[distribution]
+    link, law, priors = LAWS[distribution]
     given = {"sd": sd, "df": df, "dispersion": dispersion}
     quantities: dict[str, Quantity] = {}
     for argument, value in given.items():
@@ -98,4 +101,13 @@ def observe(
     read += [q.reads for q in quantities.values() if q.reads]
     texts = [function_text("prior", f"{channel}_prior", w.priors, [])] if w.priors else []
     texts.append(function_text("observation", f"{channel}_observation", laws, read, setup))
-    write(model, "\n\n\n".join(texts) + "\n", f"observation {channel!r} of {model.name}")
+    text = "\n\n\n".join(texts) + "\n"
+    write(model, text, f"observation {channel!r} of {model.name}")
+
+    def all_of(kind: str) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(n for c in found for n in getattr(c, kind)))
+
+    model.components[channel] = Component(
+        channel, "observation", all_of("states"), all_of("parameters"), all_of("inputs"),
+        " + ".join(c.value for c in found), text, False, any(c.reads_time for c in found), link,
+    )  # fmt: skip

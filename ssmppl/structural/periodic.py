@@ -65,7 +65,7 @@ def seasonal(
         turn = f"ssm.structural.rotation({period}, {n})"
         size = 2 * n - (2 * n == period)
         w.state(name, w.start("initial", initial, size), noise(f"{turn} @ {name}", step))
-        return w.add(f"{name}[::2].sum()", parameters=reads)
+        return w.add(f"sum({name}[::2])", parameters=reads)
     past = f"{name}_past"
     if period == 2:
         w.state(name, w.start("initial", initial), noise(f"-{name}", step))

@@ -165,7 +165,7 @@ def test_names_and_values():
     assert trend.states == ("north_level", "north_slope")
     assert trend.parameters == ("north_level_sd", "north_slope_sd")
     season = st.seasonal(model, 4, form="trigonometric", name="q")
-    assert (season.value, season.arguments) == ("q[::2].sum()", ("q",))
+    assert (season.value, season.arguments) == ("sum(q[::2])", ("q",))
     step = st.intervention(model, 5, name="strike")
     assert step.arguments == ("strike", "t")
     assert list(model.components) == ["north", "q", "strike"]
