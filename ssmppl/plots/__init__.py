@@ -39,6 +39,6 @@ from ssmppl.plots.structure import plot_components
 __all__ = [
     "free_run", "gap_closed", "missing_term", "page", "panel_figures", "pictures", "plot",
     "plot_ancestry", "plot_components", "plot_filter", "plot_forecast", "plot_likelihood",
-    "plot_maximization", "plot_model", "plot_predictions", "plot_prior_posterior", "plot_states", "ranked_effects", "residual_map",
-    "save", "separating_signal",
+    "plot_maximization", "plot_model", "plot_predictions", "plot_prior_posterior", "plot_states",
+    "ranked_effects", "residual_map", "save", "separating_signal",
 ]  # fmt: skip

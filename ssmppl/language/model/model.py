@@ -280,7 +280,7 @@ class Model:
 
     def __getstate__(self) -> dict[str, Any]:  # no other process runs this one's cells again
         functions = {r: [written(f) or f for f in fs] for r, fs in self.functions.items()}
-        fresh = {"_executions": {}, "_outdated": {}, "_shown": None}
+        fresh: dict[str, Any] = {"_executions": {}, "_outdated": {}, "_shown": None}
         return self.__dict__ | {"functions": functions} | fresh
 
     def __setstate__(self, state: dict[str, Any]) -> None:

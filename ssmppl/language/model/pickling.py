@@ -99,7 +99,11 @@ def reduced(thing: Any, state: dict[str, Any], functions: Iterable[Callable[...,
 
 def _rebuilt(kind: type[Thing], content: bytes) -> Thing:
     made = kind.__new__(kind)
-    made.__setstate__(unpacked(content))  # type: ignore[attr-defined]
+    state = unpacked(content)
+    if hasattr(made, "__setstate__"):
+        made.__setstate__(state)
+    else:
+        made.__dict__.update(state)
     return made
 
 
