@@ -22,6 +22,8 @@ exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 
 # Under another backend than the notebooks' own their figures would not be on the pages.
 os.environ.pop("MPLBACKEND", None)
+# What is told of compilation would leave empty outputs on the pages.
+os.environ["SSMPPL_PROGRESS"] = "lines"
 
 # Notebooks are Markdown files. All are run anew for every build; an error in one fails it.
 nb_execution_mode = "force"

@@ -29,6 +29,7 @@ from ssmppl import markup
 LOG = logging.getLogger("ssmppl")
 LOG.addHandler(logging.NullHandler())
 
+STYLE = "SSMPPL_PROGRESS"  # "lines": as in a log file, also on a terminal and in a notebook
 SILENT_SECONDS = 2.0  # of waiting within a call, all together, before it is told
 TICK_SECONDS = 0.5
 NEXT_LINE = 2.0  # times as long until the next line, where there is no terminal
@@ -83,6 +84,8 @@ def kind_of_stderr() -> str:
     """ "terminal", "notebook", "lines", or "none" where there is no stderr."""
     if sys.stderr is None:
         return "none"
+    if os.environ.get(STYLE) == "lines":
+        return "lines"
     if sys.stderr.isatty():
         return "terminal"
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()

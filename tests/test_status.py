@@ -197,6 +197,15 @@ def test_a_bar_in_a_notebook(notebook, monkeypatch):
     assert len(notebook.outputs) == 1
 
 
+def test_lines_on_request(notebook, screen, monkeypatch):
+    monkeypatch.setenv(status.STYLE, "lines")
+    made = screen(True)
+    filtered()
+    estimated()
+    assert notebook.outputs == []
+    assert all(line.startswith("estimated: compiling") for line in made.getvalue().splitlines())
+
+
 def test_without_a_stderr(screen, monkeypatch):
     screen()
     monkeypatch.setattr("sys.stderr", None)

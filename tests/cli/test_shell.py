@@ -1,5 +1,6 @@
 """What a shell and a terminal see: completion, colours, warnings, exit codes."""
 
+import contextlib
 import dataclasses
 import fcntl
 import os
@@ -11,12 +12,13 @@ import termios
 import warnings
 from pathlib import Path
 
+import click
 import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.run import progress as progress_module
 from ssmppl.inference.run.executors import workers_of
-from ssmppl.inference.run.progress import Progress, announced
+from ssmppl.inference.run.progress import Progress
 from tests.cli.shared import QUICK, answer, fails, interrupted_after, run, write
 from tests.diagnosis.made_up import effect_found
 
@@ -197,32 +199,16 @@ def test_a_bar_is_as_wide_as_the_terminal_and_there_where_that_does_not_tell(col
     assert abs(len(bars[-1].rstrip()) - width) <= 1
 
 
-class Late:
-    """A timer whose time has come when it is started."""
-
-    def __init__(self, seconds, tell):
-        self.start = tell
-
-    def cancel(self):
-        pass
-
-
-@pytest.mark.parametrize(
-    ("late", "shown", "told"), [(True, True, True), (False, True, False), (True, False, False)]
-)
-def test_long_work_without_a_bar_is_told_of(monkeypatch, capsys, late, shown, told):
-    if late:
-        monkeypatch.setattr(progress_module.threading, "Timer", Late)
-    with announced("PGAS", "preparing", shown=shown):
-        pass
-    assert capsys.readouterr().err.startswith("PGAS: preparing; a new model is compiled") == told
-
-
 @pytest.mark.parametrize("verb", [("sample", *QUICK), ("maximize",)], ids=["sample", "maximize"])
-def test_the_verbs_tell_of_it(series, monkeypatch, verb):
+def test_the_verbs_tell_of_work_without_a_bar(series, monkeypatch, verb):
+    @contextlib.contextmanager
+    def waiting(title, what):
+        click.echo(f"{title}: {what}", err=True)
+        yield
+
+    monkeypatch.setattr(progress_module, "waiting", waiting)
     name, *few = verb
-    monkeypatch.setattr(progress_module.threading, "Timer", Late)
-    told = "a new model is compiled first, once"
+    told = {"sample": "Gibbs: preparing", "maximize": "DirectOptimization: maximising"}[name]
     assert told in run(name, "walk.py", series, *few).stderr
     assert told not in run(name, "walk.py", series, "--no-progress", *few).stderr
 
