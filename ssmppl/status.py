@@ -176,20 +176,20 @@ class _Status:
         if call.waited + now - first < SILENT_SECONDS or not all(c.shown for c in self.calls):
             return
         seconds = now - (call.began if call in self.calls else first)
-        text = f"{wait.title or call.name}: {wait.what}"
+        # The seconds stand where a narrow terminal does not cut them off.
+        text = f"{wait.title or call.name} [{clock(seconds)}]: {wait.what}"
         kind = kind_of_stderr()
         if kind == "terminal":
             if self._bar is None:
                 self._bar = tqdm(
                     total=0, bar_format="{desc}", leave=False, file=sys.stderr, **terminal_shape()
                 )
-            self._bar.set_description_str(f"{text} [{clock(seconds)}]")
+            self._bar.set_description_str(text)
         elif kind == "notebook":
             self._output = self._output or Output()
-            line = f"{text} [{clock(seconds)}]"
-            self._output.show(f"<code>{markup.text(line)}</code>", line)
+            self._output.show(f"<code>{markup.text(text)}</code>", text)
         elif kind == "lines" and call.lines and seconds >= call.next_line:
-            print(f"{text} [{clock(seconds)}]", file=sys.stderr, flush=True)
+            print(text, file=sys.stderr, flush=True)
             call.next_line = min(NEXT_LINE * seconds, seconds + LONGEST_PAUSE)
 
     def _hide(self) -> None:

@@ -102,8 +102,7 @@ def test_a_terminal_is_told_what_is_compiled_and_for_how_long(screen):
     made = screen(True)
     filtered()
     shown = re.split(r"\r", made.getvalue())
-    assert any("filtered: compiling the particle filter, once" in s for s in shown)
-    assert any("[00:00]" in s for s in shown)
+    assert any("filtered [00:00]: compiling the particle filter, once" in s for s in shown)
     assert shown[-1].strip() == ""  # nothing is left of it
 
 
@@ -119,7 +118,7 @@ def test_short_compilations_add_up(screen):
     filtered(seconds=0.05)
     assert made.getvalue() == ""
     filtered(seconds=0.03, times=12)
-    assert "filtered: compiling" in made.getvalue()
+    assert "filtered [00:00]: compiling" in made.getvalue()
 
 
 def test_lines_where_there_is_no_terminal(screen):
@@ -128,7 +127,7 @@ def test_lines_where_there_is_no_terminal(screen):
     assert made.getvalue() == ""
     estimated()
     lines = made.getvalue().splitlines()
-    assert lines[0].startswith("estimated: compiling the particle filter, once")
+    assert lines[0].startswith("estimated [00:00]: compiling the particle filter, once")
     assert len(lines) < 5  # the pauses become longer
 
 
@@ -159,7 +158,7 @@ def test_verbs_tell_under_their_names(screen, monkeypatch, verb, lines):
         made = screen(terminal)
         with pytest.raises(ssm.DataError, match="enough"):
             verb(level, DATA, *(() if lines else ({"q": 1.0, "r": 1.0},)))
-        assert (f"{verb.__name__}: compiling" in made.getvalue()) is (lines or terminal)
+        assert (f"{verb.__name__} [00:00]: compiling" in made.getvalue()) is (lines or terminal)
     if lines:
         made = screen(True)
         with pytest.raises(ssm.DataError, match="enough"):
@@ -171,7 +170,7 @@ def test_what_takes_long_is_announced(screen):
     made = screen(True)
     with announced("PMMH", "preparing"):
         time.sleep(0.1)
-    assert "PMMH: preparing [00:00]" in made.getvalue()
+    assert "PMMH [00:00]: preparing" in made.getvalue()
 
 
 def test_a_notebook_has_an_output_that_is_taken_away(notebook):
@@ -203,7 +202,9 @@ def test_lines_on_request(notebook, screen, monkeypatch):
     filtered()
     estimated()
     assert notebook.outputs == []
-    assert all(line.startswith("estimated: compiling") for line in made.getvalue().splitlines())
+    assert all(
+        line.startswith("estimated [00:00]: compiling") for line in made.getvalue().splitlines()
+    )
 
 
 def test_without_a_stderr(screen, monkeypatch):
