@@ -94,7 +94,7 @@ def edges(
         first += len(t.free)
         support = t.site.distribution.support()
         bounds = [e for end in (support.lower, support.upper) for e in array(end).ravel()]
-        for i, edge in _reached(t, found[own], kept[own], known):
+        for i, edge in reached(t, found[own], kept[own], known):
             components[place[t.components[i]]] = edge
             if symbols_of(bounds) - fixed:
                 moving.add(place[t.components[i]])
@@ -109,7 +109,7 @@ def held_at(setup: Maximization, found: Edges | None, theta: np.ndarray) -> Edge
     return replace(found, z=_inside(setup, theta))
 
 
-def _reached(
+def reached(
     t: Transform, found: np.ndarray, kept: np.ndarray, known: dict[Expr, float]
 ) -> list[tuple[int, float]]:
     """(component, edge) of one parameter; what is not identified beside it is no longer kept, and

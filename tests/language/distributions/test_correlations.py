@@ -11,7 +11,8 @@ import ssmppl as ssm
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
-from ssmppl.expressions.expr import symbol
+from ssmppl.expressions.expr import symbol, symbols_of
+from ssmppl.inference.maximum.edges import reached
 from ssmppl.inference.updates.slices import correlations_at, sweep_correlations
 from ssmppl.language.distributions import Draws
 from ssmppl.language.model.transforms import free_correlations, transforms
@@ -131,6 +132,12 @@ def some_matrix(dim, seed=3):
     a = np.random.default_rng(seed).standard_normal((dim, dim + 1))
     c = a @ a.T
     return c / np.sqrt(np.outer(np.diag(c), np.diag(c)))
+
+
+def test_a_model_reads_ones_on_the_diagonal():
+    law = trace(correlated()).transition["x"].distribution
+    read = {s.data[2] for s in symbols_of(law.expressions()) if s.data[1] == "R"}
+    assert read == {(1, 0), (2, 0), (2, 1)}
 
 
 @pytest.mark.parametrize("dim", [2, 3, 5])
@@ -295,6 +302,19 @@ def test_a_correlation_whose_maximum_is_at_one_is_held_there():
     assert found.parameters["R"][0, 1] == pytest.approx(1.0, abs=1e-3)
     assert np.isnan(found.standard_errors["R"][0, 1])
     assert found.standard_errors["m"] > 0.0
+
+
+def test_beside_a_correlation_of_one_the_others_of_its_row_are_not_identified():
+    """R[2, 0] at 1: R[2, 1] follows from R[1, 0], whatever its partial correlation is."""
+    made = transforms(trace(correlated()))[0]
+    names = [s.data[2] for s in made.components]
+    found, kept = np.array([0.0, 1.0, 0.0]), np.array([True, False, True])
+    assert reached(made, found, kept, {}) == [(names.index((2, 0)), 1.0)]
+    assert kept.tolist() == [True, False, False]
+    # an edge of a partial correlation is none of the correlation itself
+    found, kept = np.array([0.0, 0.0, -1.0]), np.array([True, True, False])
+    assert reached(made, found, kept, {}) == []
+    assert kept.all()
 
 
 def test_the_integral_over_a_posterior_by_evidence_draws():
