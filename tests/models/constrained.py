@@ -28,7 +28,7 @@ def correlated_observation(x):
     return {"y": ssm.Normal(x, sd=0.4)}
 
 
-# Noises of sensors that are correlated, heavy-tailed states: no linear Gaussian model.
+# Noises of sensors that are correlated, of a state that moves non-linearly.
 sensors = ssm.Model("sensors")
 
 
@@ -44,7 +44,7 @@ def sensors_initial():
 
 @sensors.transition
 def sensors_transition(x, q):
-    return {"x": ssm.StudentT(5, 0.8 * x, scale=q)}
+    return {"x": ssm.Normal(1.5 * np.tanh(x), sd=q)}
 
 
 @sensors.observation
