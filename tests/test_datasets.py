@@ -35,6 +35,13 @@ def test_the_nile_is_the_published_series():
     assert datasets.load("nile")["time"].tolist() == nile["year"].tolist()
 
 
+def test_the_airline_passengers():
+    y, known = datasets.airline(), datasets.load("airline")
+    assert (len(y), y[0], y[-1], y.max(), y.sum()) == (144, 112.0, 432.0, 622.0, 40363.0)
+    months = 12 * (known["year"] - 1949) + known["month"]
+    assert months.tolist() == list(range(1, 145))
+
+
 def test_the_boys_in_bed():
     y = datasets.boarding_school()
     assert y.tolist() == [3, 8, 28, 75, 221, 291, 255, 235, 190, 125, 70, 28, 12, 5]

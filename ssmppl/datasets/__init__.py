@@ -11,6 +11,7 @@ import numpy as np
 from ssmppl.errors import ArgumentError, listing
 
 __all__ = [
+    "airline",
     "boarding_school",
     "ice_varves",
     "lgss_appendix",
@@ -58,6 +59,20 @@ def load(name: str) -> dict[str, np.ndarray]:
     header, *rows = csv.reader(text.splitlines())
     columns = np.array(rows, dtype=np.float64).T
     return {column: values.copy() for column, values in zip(header, columns, strict=True)}
+
+
+def airline() -> np.ndarray:
+    """Passengers of international airlines in each month from January 1949 to December 1960.
+
+    Series G of Box and Jenkins, *Time Series Analysis: Forecasting and Control* (1970). The months
+    are the columns `year` and `month` of `load("airline")`.
+
+    Returns
+    -------
+    float64 array (144,)
+        Thousands of passengers.
+    """
+    return load("airline")["passengers"]
 
 
 def boarding_school() -> np.ndarray:

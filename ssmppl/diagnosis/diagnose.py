@@ -157,7 +157,7 @@ class _Diagnosis:
     ):  # fmt: skip
         self.failures, self.horizon = failures, horizon
         self.began = time.perf_counter()
-        self.problem = pose(model, data, noting=True, whole=True)
+        self.problem = pose(model, data, noting=True)
         self.trace = self.problem.trace
         check_samplers(self.trace)
         need_density(self.trace, "the diagnosis", "diagnose")

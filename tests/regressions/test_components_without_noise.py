@@ -17,6 +17,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.structure import deterministic_memory, linear_gaussian
+from ssmppl.diagnosis.report.model_file import to_model
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.evaluate import evaluate
@@ -227,8 +228,36 @@ def test_forecast_and_predict():
     assert np.all(np.isfinite(ahead["y"]))
 
 
+@pytest.mark.slow
+def test_the_diagnosis():
+    """An autoregression of order 2 is diagnosed as one whose past is a state of its own."""
+    found = [
+        ssm.diagnose(m(), DATA, mode="fast", seed=1, progress=False)
+        for m in (companion, by_components)
+    ]
+    assert found[0].verdict == found[1].verdict
+
+
 def test_the_diagnosis_asks_for_states_of_their_own():
+    model = ssm.Model("acceleration")
+    model.prior(lambda: {"q": ssm.InverseGamma(3, scale=1)})
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(2), sd=1)})
+
+    def transition(x, q):
+        return {"x": ssm.MvNormal(x, covariance=q * np.outer([0.5, 1.0], [0.5, 1.0]))}
+
+    model.transition(transition)
+    model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
     with pytest.raises(ArgumentError, match=r"singular \(rank 1 of 2\)") as caught:
-        ssm.diagnose(companion(), DATA, mode="fast", seed=1, progress=False)
+        ssm.diagnose(model, DATA, mode="fast", seed=1, progress=False)
     assert "ssm.Dirac" in caught.value.fix
     assert caught.value.where.file == __file__
+
+
+def test_what_the_diagnosis_writes_is_the_model():
+    """The file of a model has its vector as it was declared."""
+    traced = trace(companion())
+    again = trace(to_model(traced))
+    assert [str(s.distribution) for s in again.transition.values()] == [
+        str(s.distribution) for s in traced.transition.values()
+    ]

@@ -284,7 +284,7 @@ def _moved(
         with attributed(locations, c.effect.where):
             for label, by in bind(c, equations, role, names[c.strength]).changes.items():
                 target = equations.parts[label]
-                at = (target.name, target.index)
+                at = equations.place(target, role)
                 free = [into for into in layers[role, c.change] if at not in into]
                 if not free:
                     layers[role, c.change].append({})

@@ -221,6 +221,8 @@ def _reason(effect: Effect, part: Part, equations: Equations, scales: Scales) ->
         found = has_scale(equations.law(part))
     elif change == "tail":
         found = has_tail(equations.law(part))
+        if equations.place(part)[0] != part.name and part.role == "state":
+            found = f"it is a component of {part.name!r}, of which others have no noise"
     else:
         found = _unused(part, equations)
     if isinstance(found, NotApplicable):

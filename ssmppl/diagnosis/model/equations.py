@@ -39,7 +39,7 @@ from ssmppl.expressions.expr import (
 from ssmppl.expressions.node import SEVERAL
 from ssmppl.inference.preparation.initial_values import ordinary_values
 from ssmppl.language.distributions import Dirac, Distribution
-from ssmppl.language.model.trace import Trace, previous, symbols
+from ssmppl.language.model.trace import Site, Trace, previous, symbols
 
 Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
 
@@ -130,22 +130,31 @@ class Equations:
     def law(self, part: Part, role: str = "") -> Distribution:
         """The distribution of a state (in the transition unless role is "initial") or of a
         channel."""
+        return self.site(part, role).distribution
+
+    def site(self, part: Part, role: str = "") -> Site:
+        """The site of that distribution."""
         if part.role == "channel":
-            return self.trace.observations[part.name].distribution
-        sites = self.trace.initial if role == "initial" else self.trace.transition
-        return sites[part.name].distribution
+            return self.trace.observations[part.name]
+        return self.trace.law_of(part.symbol, "initial" if role == "initial" else "transition")
+
+    def place(self, part: Part, role: str = "") -> tuple[str, tuple[int, ...]]:
+        """The name of the site, and where in it the part is."""
+        site = self.site(part, role)
+        return site.name, site.index_of(part.symbol)
 
     def mean(self, part: Part, role: str = "") -> Expr | NotApplicable:
         """The value without noise of a state's or channel's distribution; why there is none."""
-        d = self.law(part, role)
+        d, (_, index) = self.law(part, role), self.place(part, role)
         scale = scale_of_mean(d)
-        return scale if isinstance(scale, NotApplicable) else noise_free(d, part.index)
+        return scale if isinstance(scale, NotApplicable) else noise_free(d, index)
 
     def reading(self, part: Part) -> Expr | NotApplicable:
         """What a channel reads without noise, on the scale on which increments of its mean act."""
         d = self.law(part)
         scale = scale_of_mean(d)
-        return scale if isinstance(scale, NotApplicable) else on_its_scale(d, part.index)
+        index = self.place(part)[1]
+        return scale if isinstance(scale, NotApplicable) else on_its_scale(d, index)
 
     def step(self, part: Part) -> Expr | NotApplicable:
         """mean - x_prev: how far a state moves in a step, without noise in it nor in new values of
@@ -311,9 +320,12 @@ def time_symbol(role: str) -> Expr:
 
 def components(trace: Trace, role: str, name: str, shape: tuple[int, ...]) -> Any:
     """The symbols of a named quantity seen from a distribution, a node for a scalar."""
-    site = {"state": trace.initial, "channel": trace.observations,
-            "parameter": trace.parameters}.get(role, {}).get(name)  # fmt: skip
-    value = symbols("input", name, shape) if site is None else site.value
+    if role == "state":
+        value = trace.states[name]
+    elif role in ("channel", "parameter"):
+        value = (trace.observations if role == "channel" else trace.parameters)[name].value
+    else:
+        value = symbols("input", name, shape)
     return value[()] if array(value).shape == () else value
 
 

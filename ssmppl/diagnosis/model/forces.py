@@ -115,7 +115,8 @@ def linear(trace: Trace, pushes: list[tuple[Force, Expr]]) -> Trace:
             lagged = [s for s in symbols_of([by]) if s.data[0].endswith("_prev")]
             by = substitute([by], {s: _now(s) for s in lagged})[0]
             drawn = {s: constant(0.0) for s in symbols_of([by]) if s in noises}
-            add(noise.data[1], noise.data[2], substitute([by], drawn)[0])
+            site = trace.law_of(noise)
+            add(site.name, site.index_of(noise), substitute([by], drawn)[0])
             continue
         for name, site in trace.transition.items():
             for index, item in _means(site.distribution).items():

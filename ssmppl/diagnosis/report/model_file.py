@@ -40,6 +40,7 @@ from ssmppl.language.distributions import (
 )
 from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
+from ssmppl.language.model.covariances import together
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive, primitives_in
@@ -95,6 +96,7 @@ def to_model(trace: Trace) -> Model:
 
 class _Writer:
     def __init__(self, trace: Trace, added: dict[str, Candidate]):
+        trace = together(trace)
         self.trace, self.added = trace, added
         self.special = False
         sites = [*trace.initial.items(), *trace.parameters.items(), *trace.observations.items()]

@@ -19,7 +19,6 @@ from ssmppl.data import Experiment, bind
 from ssmppl.data.notices import warn_of
 from ssmppl.data.per_experiment import trace_over
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
-from ssmppl.language.model.covariances import together
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
 
@@ -127,18 +126,16 @@ def missing_of(experiments: Sequence[Experiment]) -> Missing:
     return Missing(none, partial.union(*(e.partial for e in experiments)))
 
 
-def pose(model: Model, data: Any, *, noting: bool = False, whole: bool = False) -> Problem:
+def pose(model: Model, data: Any, *, noting: bool = False) -> Problem:
     """Trace the model, bind the data and compile.
 
-    noting : whether to warn of what the data seem to lack (`data/notices.py`). whole : every state
-        under one distribution, as declared, though some of its components have no noise.
+    noting : whether to warn of what the data seem to lack (`data/notices.py`).
 
     Raises
     ------
     ModelError, DataError : naming the place, what was found and the fix.
     """
     traced = trace_over(model, data)
-    traced = together(traced) if whole else traced
     if not traced.observations:
         raise ModelError(
             f"model {traced.name!r} has no @observation function: there is nothing to condition on",

@@ -63,6 +63,11 @@ class Site:
         name: str = self.value.ravel()[0].data[1]
         return name
 
+    def index_of(self, s: Expr) -> tuple[int, ...]:
+        """Where a component is in `value`."""
+        index: tuple[int, ...] = s.data[2]
+        return index if self.name == s.data[1] else (self.components.index(s),)
+
     @cached_property
     def components(self) -> list[Expr]:
         """The distinct symbols of the value, row by row."""
