@@ -141,6 +141,13 @@ class Writer:
 
     def sd(self, name: str, argument: str, given: Any) -> Quantity:
         """A standard deviation: by default a parameter with a flat prior."""
+        if isinstance(given, Distribution):
+            lower = given.support().lower.ravel()
+            if given.shape or any(e.op != "const" or e.data < 0.0 for e in lower):
+                raise self.wrong(
+                    argument, given, "give the distribution of a positive number, such as "
+                    "ssm.HalfNormal(sd=...)",
+                )  # fmt: skip
         found = self.quantity(name, argument, given, "ssm.HalfFlat()")
         if not found.reads and float(found.text) < 0.0:
             raise self.wrong(argument, given, "a standard deviation is not negative")
@@ -336,10 +343,10 @@ def spelled(law: Distribution, argument: str, kind: str) -> str:
     ------
     ArgumentError : it is made of other distributions, or holds symbols.
     """
+    if isinstance(law, Flat):
+        return f"ssm.{law!r}"
     values = {n: constant_of(p) for n, p in law.parameters.items()}
     if law.inside() or not values or any(v is None for v in values.values()):
-        if type(law).__name__ in ("Flat", "HalfFlat") and not law.shape:
-            return f"ssm.{type(law).__name__}()"
         raise ArgumentError(
             f"ssm.structural.{kind}: {argument}={law!r} is no plain distribution of numbers",
             fix=f'declare it in a @prior of yours and give its name, {argument}="my_parameter"',

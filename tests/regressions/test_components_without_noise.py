@@ -21,6 +21,7 @@ from ssmppl.diagnosis.report.model_file import to_model
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import symbol, symbols_of
 from ssmppl.language.model.covariances import together
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.tracing import trace
@@ -189,6 +190,9 @@ def test_new_values_of_what_has_no_noise():
     model.transition(first)
     model.transition(lambda z, x_next: {"z": ssm.Normal(z + x_next[0] + 2 * x_next[1], sd=1)})
     model.observation(lambda z: {"y": ssm.Normal(z, sd=1)})
+    read = symbols_of(trace(model).transition["z"].distribution.arguments())
+    assert symbol("state", "x", (0,)) in read
+    assert symbol("state", "x", (1,)) not in read
     form = linear_gaussian(trace(model))
     assert numbers(form.A)[2].tolist() == [2.5, 0.0, 1.0]
     assert numbers(form.Q).tolist() == [[1, 0, 1], [0, 0, 0], [1, 0, 2]]

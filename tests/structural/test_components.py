@@ -199,10 +199,16 @@ BAD = {
     "a state of two": (lambda m: (st.level(m), st.trend(m)), "gives 'level', as 'level'", "name="),
     "no model": (lambda m: st.level("m"), "is str, not a model", "ssm.Model"),
     "name": (lambda m: st.level(m, name="a level"), "name='a level'", "letters"),
+    "sd of any sign": (
+        lambda m: st.level(m, sd=ssm.Normal(0, sd=1)), "sd=Normal", "ssm.HalfNormal"
+    ),
+    "sd of a vector": (
+        lambda m: st.level(m, sd=ssm.HalfNormal(sd=np.ones(2))), "sd=HalfNormal", "positive number"
+    ),
     "negative": (lambda m: st.level(m, sd=-1), "sd=-1", "not negative"),
     "sd": (lambda m: st.level(m, sd=[1, 2]), "sd=[1, 2]", "a distribution as its prior"),
     "sd of symbols": (
-        lambda m: st.level(m, sd=ssm.Truncated(ssm.Normal(0, sd=1), lower=0)),
+        lambda m: st.level(m, sd=ssm.Truncated(ssm.Normal(0, sd=1), lower=0.0)),
         "no plain distribution", 'sd="my_parameter"',
     ),
     "initial": (lambda m: st.level(m, initial="high"), "initial='high'", "ssm.Normal"),
@@ -269,3 +275,22 @@ def test_what_its_own_functions_declare_twice():
     model.initial(lambda: {"level": ssm.Normal(0, sd=1)})
     with pytest.raises(ModelError, match="'level' is given by two @initial functions"):
         trace(model)
+
+
+PRIORS = [
+    ssm.HalfNormal(sd=0.1), ssm.HalfCauchy(scale=2), ssm.Gamma(2, rate=0.5), ssm.Gamma(2, scale=4),
+    ssm.InverseGamma(3, scale=0.125), ssm.Exponential(rate=3), ssm.LogNormal(-1, sd=0.5),
+    ssm.Weibull(1.5, scale=2), ssm.Uniform(0, 1e-7), ssm.HalfFlat(), ssm.Beta(2, 3),
+    ssm.StudentT(4, 0, scale=1), ssm.Cauchy(0, scale=1), ssm.Laplace(0, scale=1),
+    ssm.Normal(0, variance=2), ssm.Normal(1 / 3, precision=7),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("law", PRIORS, ids=repr)
+def test_priors_are_written_as_they_are(law):
+    model = ssm.Model("m")
+    st.observe(model, "y", st.level(model, initial=1), st.intervention(model, 3, effect=law))
+    found = trace(model).parameters["step_3"].distribution
+    assert repr(found) == repr(law)
+    for name, values in law.parameters.items():
+        assert found.parameters[name].ravel()[0] is values.ravel()[0]

@@ -208,7 +208,8 @@ class Model:
 
         Parameters
         ----------
-        function : returns the distributions of all states by name; its arguments are parameters,
+        function : returns the distributions of states by name, all of them or some; its arguments
+            are parameters,
             inputs and ``t``.
 
         Returns
