@@ -35,7 +35,7 @@ ALLOWED["tables"] = {"errors", "results"}
 ALLOWED["datasets"] = {"errors"}
 # ... and serve what follows. Adapters make simulators of the language.
 ALLOWED["simulators"] = {"errors", "expressions", "language"}
-ALLOWED["structural"] = {"compiling", "errors", "expressions", "language"}
+ALLOWED["structural"] = {"arguments", "compiling", "errors", "expressions", "language"}
 ALLOWED["inference"] = {*CHAIN, "counts", "data", "results"}
 ALLOWED["drawing"] = {"errors", "data"}
 ALLOWED["diagnosis"] = ALLOWED["inference"] | {"inference", "drawing"}

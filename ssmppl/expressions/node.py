@@ -327,6 +327,7 @@ _OWN = tuple(
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
     for d in ("expressions", "language", "simulators", "structural")
 )
+_OWN += (os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "arguments.py"),)
 _OWN += tuple(  # SciPy lies beside NumPy
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(np.__file__))), d) + os.sep
     for d in ("numpy", "scipy")

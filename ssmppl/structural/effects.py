@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.arguments import checked
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.distributions import Distribution
@@ -25,6 +26,7 @@ KINDS = {  # what an effect of 1 adds at row t
 }
 
 
+@checked
 def regression(
     model: Any, inputs: Any, *, coefficients: Any = None, random_walk: bool = False,
     sd: Any = None, name: str = "regression",
@@ -90,6 +92,7 @@ def regression(
     return w.add(" + ".join(terms), names, reads)
 
 
+@checked
 def intervention(
     model: Any, row: int, *, kind: str = "step", effect: Any = None, name: str | None = None
 ) -> Component:
@@ -130,6 +133,7 @@ def intervention(
     )
 
 
+@checked
 def autoregression(
     model: Any, order: int = 1, *, coefficients: Any = None, sd: Any = None, initial: Any = None,
     name: str = "ar",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ssmppl.arguments import checked
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import user_location
 from ssmppl.structural.component import (
@@ -35,6 +36,7 @@ LAWS: dict[str, tuple[str, str, dict[str, str]]] = {
 }
 
 
+@checked
 def observe(
     model: Any, channel: str, *components: Component | str, distribution: str = "normal",
     sd: Any = None, df: Any = None, dispersion: Any = None,

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.arguments import checked
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import user_location
 from ssmppl.structural.component import Component, Quantity, Writer, noise, number
@@ -15,6 +16,7 @@ from ssmppl.structural.trends import UNIT
 FORMS = ("dummy", "trigonometric")
 
 
+@checked
 def seasonal(
     model: Any, period: int, *, form: str = "dummy", harmonics: int | None = None, sd: Any = None,
     initial: Any = None, name: str = "season",
@@ -76,6 +78,7 @@ def seasonal(
     return w.add(name, parameters=reads)
 
 
+@checked
 def cycle(
     model: Any, period: Any, *, damping: Any = None, sd: Any = None, initial: Any = None,
     name: str = "cycle",

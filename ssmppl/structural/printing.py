@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.arguments import checked
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.model.closure_digest import outer_values, plain_function
@@ -19,6 +20,7 @@ PLAIN = (type(None), bool, int, float, str)
 LARGEST = 1000  # numbers of an array that is written out
 
 
+@checked
 def source(model: Any) -> str:
     """The source of a model, runnable as it stands: its components, and the functions of the user.
 

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from ssmppl.arguments import checked
 from ssmppl.structural.component import Component, Writer, noise
 
 UNIT = "ssm.Uniform(0, 1)"
 
 
+@checked
 def level(model: Any, *, sd: Any = None, initial: Any = None, name: str = "level") -> Component:
     """A level that moves as a random walk (Harvey 1989, section 2.3.1).
 
@@ -45,6 +47,7 @@ def level(model: Any, *, sd: Any = None, initial: Any = None, name: str = "level
     return w.add(name, parameters=[step.reads] if step.reads else [])
 
 
+@checked
 def trend(
     model: Any, *, level_sd: Any = None, slope_sd: Any = None, damping: Any = None,
     initial: Any = None, initial_slope: Any = None, name: str | None = None,

@@ -205,6 +205,7 @@ BAD = {
     "sd of a vector": (
         lambda m: st.level(m, sd=ssm.HalfNormal(sd=np.ones(2))), "sd=HalfNormal", "positive number"
     ),
+    "another argument": (lambda m: st.level(m, sigma=1), "no argument 'sigma'", "sd"),
     "negative": (lambda m: st.level(m, sd=-1), "sd=-1", "not negative"),
     "sd": (lambda m: st.level(m, sd=[1, 2]), "sd=[1, 2]", "a distribution as its prior"),
     "sd of symbols": (
@@ -259,7 +260,8 @@ def test_what_is_refused(name: str):
         bad(bad_model())
     assert found in caught.value.found
     assert fix in caught.value.fix
-    assert caught.value.where.file == __file__
+    if name != "another argument":
+        assert caught.value.where.file == __file__
 
 
 def test_a_parameter_that_is_not_there():
