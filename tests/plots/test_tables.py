@@ -148,7 +148,7 @@ def test_a_report_says_what_it_prints():
     report = effect_found()
     read = Read(report._repr_html_())
     printed = " ".join(str(report).split())
-    for name in ("Where", "Which", "How far", "How sure"):
+    for name in ("Where", "Which", "Gain", "Evidence"):
         (row,) = [r for r in read.rows if r[0] == name]
         assert " ".join(row[1].split())[:60] in printed
     assert [r[0] for r in read.rows if r[0].startswith("→")] == ["→ quadratic drag in v"]

@@ -47,8 +47,8 @@ TABLES = {
     "causes": "All effects tried, best first",
     "classes": "Effects not distinguishable by these data",
     "probabilities": "Which effect came first, in data simulated with each",
-    "signals": "Signals that were tried to distinguish them, best first",
-    "where": "Where the gap is",
+    "signals": "Signals tried to distinguish them, best first",
+    "where": "Places of misfit",
     "closed": "Held-out gain",
     "detection": "Tests of the one-step predictions",
 }
@@ -64,7 +64,7 @@ CAPTIONS = {
     "missing_term": "The term missing from the equation in each step, estimated by smooth "
     "functions, with its pointwise 95% band. Where the band contains zero, the term is not "
     "significant.",
-    "free_run": "Open-loop simulation: each model is started once and does not see the data again. "
+    "free_run": "Open-loop simulation: each model is started once and uses no later data. "
     "Shaded: 95% prediction interval.",
     "experiment": "The input of the experiment, held over each row, and the one that was recorded. "
     "Other inputs, if there are any, stay as they were recorded.",
@@ -173,10 +173,10 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
         f"<p>{_text(words.headline(report))}</p>", "</section>",
         f'<section class="first">{opening}</section>' if opening else "",
         _answers(report),
-        _section("How sure", _list(words.how_sure(report)) + _unknown(report)),
-        _section("What would decide", _experiment(report, drawn_experiment)),
+        _section("Evidence", _list(words.how_sure(report)) + _unknown(report)),
+        _section("Discriminating experiment", _experiment(report, drawn_experiment)),
         _section("Next steps", _list(words.next_steps(report))),
-        _section("The evidence", "\n".join(figures.values())),
+        _section("Plots", "\n".join(figures.values())),
         tables,
         _section("Glossary", _glossary()),
         _model(report),
@@ -226,14 +226,14 @@ def _answers(report: Findings) -> str:
     elif is_number(first["F"]):
         far, ends = percent(first["F"]), interval(first["F_low"], first["F_high"])
     cards = (
-        ("Where is the gap?", spot, "", words.where(report)),
+        ("Where is the misfit?", spot, "", words.where(report)),
         (
             "Which effect is missing?",
             cause.get(report.verdict, "; and ".join(names)),
             "",
             words.which(report),
         ),
-        ("How far does the gap close?", far, ends, words.how_far(report)),
+        ("How much does it improve predictions?", far, ends, words.how_far(report)),
     )
     body = "\n".join(
         f'<section class="card"><h2>{_text(question)}</h2><p class="large">{_text(large)}'
@@ -260,7 +260,7 @@ def _unknown(report: Findings) -> str:
 
 
 def _experiment(report: Findings, picture: str) -> str:
-    """What would tell the rivals apart, with its inputs to take away."""
+    """What would distinguish the rivals, with its inputs as a file."""
     sentences = "".join(f"<p>{_text(s)}</p>\n" for s in words.to_decide(report))
     if report.experiment is None:
         return sentences

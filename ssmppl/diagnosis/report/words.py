@@ -1,7 +1,7 @@
-"""The answers of a report in words, for readers who never heard of a score test.
+"""The results of a report in words, for readers who do not know score tests.
 
-Every function takes the report and gives plain sentences: what is missing, where, how far adding it
-closes the gap, how sure that is, and what would tell what these data cannot.
+Every function takes the report and gives plain sentences: where the misfit is, which effect is
+missing, how much adding it gains, the evidence, and an experiment where these data do not decide.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ GLOSSARY = {
     "reference model": "the model with the effects and with smooth functions of states and inputs "
     "where they help; its gain in held-out log predictive density over the original model is 100%",
     "p": "the p-value corrected for multiple testing (family-wise): an upper bound on the "
-    "probability, if the model were right, that any effect tried is this significant; of places "
-    "and of tests of the predictions five times their own. So alpha bounds the chance that an "
-    "effect is named falsely, and about 1.4 alpha (fast mode: 1.6 alpha) that of any false finding",
-    "expected log-likelihood ratio": "the mean over records like this one of how much more likely "
-    "the right effect makes them than the wrong one fitted to them; with 5.4 nats the right one is "
-    "ahead in 95% of records",
+    "probability, if the model were right, that any effect tried is this significant. The p-values "
+    "of places and of tests of the predictions are multiplied by five. So the probability that an "
+    "effect is named falsely is at most alpha, and that of any false finding at most about 1.4 "
+    "alpha (fast mode: 1.6 alpha)",
+    "expected log-likelihood ratio": "the log-likelihood of the right effect minus that of the "
+    "wrong one fitted to the same record, on average over such records; with 5.4 nats the right "
+    "one is ahead in 95% of records",
     "z": "a standardised deviation from what the model expects",
     "±": "one standard error; twice that, either way, is about a 95% interval",
 }
@@ -220,11 +221,11 @@ def significant_rows(report: Findings, table: Any) -> list[dict[str, Any]]:
 
 # -- the answers
 def sections(report: Findings) -> list[tuple[str, list[str]]]:
-    """The title and the sentences of each section: where, which, how far, how sure, and what would
-    decide."""
+    """The title and the sentences of each section: where, which, the gain, the evidence, and the
+    experiment that would decide."""
     return [
-        ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
-        ("How sure", how_sure(report)), ("To decide", to_decide(report)),
+        ("Where", where(report)), ("Which", which(report)), ("Gain", how_far(report)),
+        ("Evidence", how_sure(report)), ("Experiment", to_decide(report)),
     ]  # fmt: skip
 
 
@@ -417,9 +418,8 @@ def formula(report: Findings) -> str:
         for r in terms
     ).removeprefix("+ ")  # fmt: skip
     return (
-        f"The nearest formula, a suggestion: an increment of {terms[0]['equation']} by {text} in "
-        f"each step. It has {percent(terms[0]['share'])} of the gain of the curves; another "
-        "formula may come as near."
+        f"Suggested formula: add {text} to {terms[0]['equation']} in each step. It achieves "
+        f"{percent(terms[0]['share'])} of the gain of the curves; other formulas may fit as well."
     )
 
 
@@ -442,15 +442,15 @@ def how_far(report: Findings) -> list[str]:
     same = r is not None and r["rmse_before"] == r["rmse_after"]
     if report.verdict == NONE_OF_THESE and first["effect"] == CURVES and same:
         return [f"Not measured: {CURVES}, fitted to the first rows, do not predict other rows "
-                "better than the model as it is."]  # fmt: skip
+                "better than the original model."]  # fmt: skip
     told = simulated(report) if report.verdict != NO_GAP else ""
     if told:
         r = windows(report) or {}
         ends = f"{number(r['rmse_before'])} to {number(r['rmse_after'])}"
         out.append(
             sentence(f"{kept_back(report)}, {_subject(first)} {told}: from {ends} (RMS, units of "
-                     "the data). Each simulation starts in the state that the model's filter has "
-                     "for its first row, and does not see the data again")
+                     "the data). Each simulation starts from the filtered state at its first row "
+                     "and uses no later data")
         )  # fmt: skip
     if is_number(first["F"]):
         own = "it" if told else f"{kept_back(report)}, {_subject(first)}"
@@ -463,8 +463,8 @@ def how_far(report: Findings) -> list[str]:
         )
     else:
         out.append(sentence(
-            f"{kept_back(report)} the reference model's gain is too uncertain for a share of it: "
-            "its interval reaches zero (see the notes)"
+            f"{kept_back(report)} no share of the reference model's gain is computed, because the "
+            "interval of that gain includes zero (see the notes)"
         ))  # fmt: skip
     if report.verdict == NO_GAP:  # what no effect gained is no finding
         return out
@@ -537,64 +537,67 @@ def _recognised(report: Findings) -> str:
     if len(shares) == 1:  # forms of one effect
         return ""
     text = (
-        f"in data simulated with {own} on the same inputs, and fitted alike, it came first of "
-        f"{len(shares)} in {percent(shares.pop(own))} of the sets"
+        f"in data sets simulated with {own} and the same inputs, and fitted in the same way, it "
+        f"came first of {len(shares)} effects in {percent(shares.pop(own))} of the sets"
     )
     other = max(shares, key=lambda name: shares[name])
     return f"{text}, {other} in {percent(shares[other])}" if shares[other] > 0.0 else text
 
 
 def to_decide(report: Findings) -> list[str]:
-    """What would tell the rivals of the first class apart: an experiment, or more rows."""
+    """What would distinguish the rivals of the first class: an experiment, or more rows."""
     found = report.separation
     if found is None:
         return []
     names = list(dict.fromkeys(label(*e) for e in found.effects))
     two = len(found.effects) == 2
-    pair = "between the two" if two else "between the two that are hardest to tell apart"
+    pair = "between the two" if two else "between the two that are hardest to distinguish"
     needed, recorded = number(found.needed, 2), number(found.recorded, 2)
-    out = [f"These records do not tell {listed(names, 'from')}."]
+    out = [f"These records do not distinguish {listed(names, 'from')}."]
     if len(names) == 1:
-        out = [f"These records do not tell the forms of {names[0]} apart."]
+        out = [f"These records do not distinguish the forms of {names[0]}."]
     if len(names) > 2:
         first = f" (the first {len(names)} of {found.members})" * (found.members > len(names))
-        out = [f"These records do not tell {listed(names)} apart{first}."]
+        out = [f"These records do not distinguish {listed(names)}{first}."]
     if found.as_recorded:
         return [*out, f"Another {found.rows:,} rows {_recorded_kind(found)} are expected to "
-                f"(expected log-likelihood ratio {recorded} nats {pair}, {needed} are enough): no "
-                "other experiment is needed."]  # fmt: skip
+                f"distinguish them (expected log-likelihood ratio {recorded} nats {pair}, "
+                f"{needed} are enough): no other experiment is needed."]  # fmt: skip
     if found.best is not None and found.runs:
         again, each = "", ""
         if found.runs > 1:
             again, each = f", run {found.runs} times", " in each run"
         return [
             *out,
-            sentence(f"{found.best.signal.words} would{again} (expected log-likelihood ratio "
-                     f"{number(found.best.nats, 2)} nats {pair}{each}, {needed} are enough; with "
-                     f"the recorded inputs: {recorded}): experiment.csv"),
-            f"It keeps {found.best.input} within its recorded range and, by the models, what is "
-            "observed near its own.",
-            f"Without it, it would take {_more_rows(found)}.",
+            sentence(f"{found.best.signal.words} would distinguish them{again} (expected "
+                     f"log-likelihood ratio {number(found.best.nats, 2)} nats {pair}{each}, "
+                     f"{needed} are enough; with the recorded inputs: {recorded}). The inputs are "
+                     "in experiment.csv"),
+            f"The signal keeps {found.best.input} within its recorded range, and the models predict "
+            "that the outputs stay near theirs.",
+            f"Without this experiment {_more_rows(found)} would be needed.",
         ]  # fmt: skip
     if found.tried:
-        return [*out, *_none_separates(found, pair), f"It would take {_more_rows(found)}."]
-    return [*out, f"There is no input to vary: it would take {_more_rows(found)} (expected "
-            f"log-likelihood ratio of these: {recorded} nats {pair}; {needed} are "
+        return [*out, *_none_separates(found, pair),
+                sentence(f"{_more_rows(found)} would be needed")]  # fmt: skip
+    return [*out, f"There is no input to vary: {_more_rows(found)} would be needed (expected "
+            f"log-likelihood ratio of this record: {recorded} nats {pair}; {needed} are "
             "needed)."]  # fmt: skip
 
 
 def _none_separates(found: Separation, pair: str) -> list[str]:
     """That no signal would do, with the best figure, and why most have none."""
     inputs = listed(list(dict.fromkeys(t.input for t in found.tried)))
-    text = f"none of the {len(found.tried)} signals of {inputs} that were tried would"
+    text = f"none of the {len(found.tried)} signals of {inputs} that were tried would " \
+           "distinguish them"  # fmt: skip
     if found.best is not None and found.best.nats >= SURE:
         text += f"; the best, {found.best.signal.words}, has an expected log-likelihood ratio of " \
                 f"{number(found.best.nats, 2)} nats {pair}, and {number(found.needed, 2)} are " \
                 f"needed (with the recorded inputs: {number(found.recorded, 2)})"  # fmt: skip
-    reasons = {ALIKE: "the models, as they are fitted, predict nearly the same",
-               OUTSIDE: "what is observed leaves its recorded range"}  # fmt: skip
+    reasons = {ALIKE: "the fitted models predict nearly the same",
+               OUTSIDE: "the outputs leave their recorded range"}  # fmt: skip
     counts = {note: sum(t.note == note for t in found.tried) for note in reasons}
-    why = [f"under {counts[note]} of them {reasons[note]}" for note in reasons if counts[note]]
+    why = [f"for {counts[note]} of them {reasons[note]}" for note in reasons if counts[note]]
     out = [sentence(text), *([sentence(listed(why))] if why else [])]
     if 2 * counts[ALIKE] > len(found.tried):
         out.append("In the recorded range it makes little difference which of them is used.")
@@ -606,7 +609,7 @@ def _recorded_kind(found: Separation) -> str:
 
 
 def _more_rows(found: Separation) -> str:
-    """How many rows would do without another experiment."""
+    """How many rows would be enough without another experiment."""
     kind, times = _recorded_kind(found), found.times_as_many
     whole = f"the {found.rows:,} of {'this' if found.records == 1 else 'the longest'} record"
     if math.isinf(times):
@@ -637,17 +640,18 @@ def left_out(report: Findings) -> list[str]:
 
 
 def _to_distinguish(report: Findings, row: dict[str, Any]) -> list[str]:
-    """What to record, or else to do, to tell a cause from its rivals; nothing in fast mode, whose
-    classes are preliminary."""
+    """What to record, or else to do, to distinguish a cause from its rivals; nothing in fast mode,
+    whose classes are preliminary."""
     if report.mode == "fast":
         return []
     found, names = report.separation, listed(alternatives(report, row), "from")
     looked_for = found is not None and (row["effect"], row.get("equation")) in found.effects
     if found is not None and looked_for and found.as_recorded:
-        return [f"To distinguish {names}, record as much again, and diagnose all of it together."]
+        return [f"To distinguish {names}, record as much data again, and diagnose all records "
+                "together."]  # fmt: skip
     if report.experiment is not None and looked_for:
         return [f"To distinguish {names}, run experiment.csv (report.experiment in Python) on "
-                "the system, record what it does, and diagnose all records together."]  # fmt: skip
+                "the system, record the outputs, and diagnose all records together."]  # fmt: skip
     return [f"To distinguish {names}, add a sensor, inspect the system, or record it under other "
             "conditions."]  # fmt: skip
 

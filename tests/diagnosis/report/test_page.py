@@ -107,8 +107,9 @@ def test_the_page_needs_nothing_else(name):
 def test_the_answer_comes_first_then_how_sure_then_what_next_and_the_model_last():
     found = [text for _, text in Reader(page("effect_found")).all("h2")]
     assert found == [
-        "Where is the gap?", "Which effect is missing?", "How far does the gap close?",
-        "How sure", "Next steps", "The evidence", "Tables", "Glossary",
+        "Where is the misfit?", "Which effect is missing?",
+        "How much does it improve predictions?", "Evidence", "Next steps", "Plots", "Tables",
+        "Glossary",
         "Augmented model",
     ]  # fmt: skip
     paragraphs = [text for _, text in Reader(page("effect_found")).all("p")]
@@ -160,8 +161,9 @@ def test_an_experiment_stands_behind_how_sure_with_its_picture_and_its_file():
     reader = Reader(text)
     assert reader.faults == []
     order = [text.index(words) for words in (
-        ">How sure<", ">What would decide<", "These records do not tell", "triangle of u",
-        TITLES["experiment"], "Download experiment.csv", ">Next steps<", ">The evidence<",
+        ">Evidence<", ">Discriminating experiment<", "These records do not distinguish",
+        "triangle of u",
+        TITLES["experiment"], "Download experiment.csv", ">Next steps<", ">Plots<",
     )]  # fmt: skip
     assert order == sorted(order)
     link, _ = reader.all("a", download="experiment.csv")[0]
@@ -181,7 +183,7 @@ def test_without_an_experiment_its_words_alone_stand_there():
     assert "None of the 4 signals" in text
     assert TITLES["experiment"] not in text
     assert "experiment.csv" not in text
-    assert "What would decide" not in page("effect_found")
+    assert "Discriminating experiment" not in page("effect_found")
 
 
 def test_tables_scroll_in_their_boxes_and_hold_the_numbers():
@@ -192,7 +194,7 @@ def test_tables_scroll_in_their_boxes_and_hold_the_numbers():
     titles = [text for _, text in reader.all("summary")]
     assert titles == [
         "All effects tried, best first", "Effects not distinguishable by these data",
-        "Where the gap is", "Held-out gain", "Tests of the one-step predictions",
+        "Places of misfit", "Held-out gain", "Tests of the one-step predictions",
         "Parameters, with standard errors", "Settings",
     ]  # fmt: skip
     cells = [text for _, text in reader.all("td")]
@@ -205,7 +207,7 @@ def test_the_page_opens_with_the_answer_a_picture_of_simulations_and_their_error
     text = page("effect_found")
     order = [
         text.index(words)
-        for words in ("lacks one of these", TITLES["free_run"], AHEAD, "Where is the gap?",
+        for words in ("lacks one of these", TITLES["free_run"], AHEAD, "Where is the misfit?",
                       TITLES["ranked_effects"], "Glossary")
     ]  # fmt: skip
     assert order == sorted(order)

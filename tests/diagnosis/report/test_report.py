@@ -314,23 +314,26 @@ def test_what_to_do_next():
 
 
 # -- what would tell rivals apart
-RIVALS = "These records do not tell quadratic drag in v from state-dependent damping in v."
+RIVALS = "These records do not distinguish quadratic drag in v from state-dependent damping in v."
 
 
 def test_an_experiment_is_told_in_words_with_its_figures():
     found = with_experiment()
     assert to_decide(found) == [
         RIVALS,
-        "A triangle of u between −1 and 1 with a period of 40 rows would (expected log-likelihood "
-        "ratio 7.2 nats between the two, 5.4 are enough; with the recorded inputs: 0.8): "
-        "experiment.csv.",
-        "It keeps u within its recorded range and, by the models, what is observed near its own.",
-        "Without it, it would take more than 5 times as many rows with the recorded inputs as the "
-        "400 of this record.",
+        "A triangle of u between −1 and 1 with a period of 40 rows would distinguish them "
+        "(expected log-likelihood ratio 7.2 nats between the two, "
+        "5.4 are enough; with the recorded inputs: "
+        "0.8). The inputs are in experiment.csv.",
+        "The signal keeps u within its recorded range, and the models predict that the outputs "
+        "stay near theirs.",
+        "Without this experiment more than 5 times as many rows with the recorded inputs as the "
+        "400 of this record would be needed.",
     ]
     text = " ".join(str(found).split())
-    assert "To decide These records do not tell quadratic drag" in text
-    assert text.index("How sure") < text.index("To decide") < text.index("effect form strength")
+    assert "Experiment These records do not distinguish quadratic drag" in text
+    places = [text.index(s) for s in ("Evidence", "Experiment These", "effect form strength")]
+    assert places == sorted(places)
     steps = " ".join(next_steps(found))
     assert "run experiment.csv (report.experiment in Python) on the system" in steps
 
@@ -338,16 +341,17 @@ def test_an_experiment_is_told_in_words_with_its_figures():
 def test_an_experiment_to_be_run_several_times():
     """2.2 nats a run are enough in three, which is no more than were recorded; not so in two."""
     told = " ".join(to_decide(with_experiment(separation(2.2, records=3))))
-    assert "40 rows would, run 3 times (expected log-likelihood ratio 2.2 nats between the two " \
-           "in each run, 5.4" in told  # fmt: skip
+    assert "40 rows would distinguish them, run 3 times (expected log-likelihood ratio 2.2 nats " \
+           "between the two in each run, 5.4" in told  # fmt: skip
     assert "as the 400 of the longest record" in told
     told = " ".join(to_decide(with_experiment(separation(2.2, recorded=1.35, records=2))))
-    assert "None of the 4 signals of u that were tried would; the best, a triangle of u between " \
-           "−1 and 1 with a period of 40 rows, has an expected log-likelihood ratio of 2.2 nats " \
-           "between the two, and 5.4 are needed (with the recorded inputs: 1.4). Under 1 of them " \
-           "the models, as they are fitted, predict nearly the same and under 1 of them what is " \
-           "observed leaves its recorded range. It would take about 1,600 rows with the " \
-           "recorded inputs, 4 times as many as the 400" in told  # fmt: skip
+    assert "None of the 4 signals of u that were tried would distinguish them; the best, a " \
+           "triangle of u between −1 and 1 with a period of 40 rows, " \
+           "has an expected log-likelihood ratio " \
+           "of 2.2 nats between the two, and 5.4 are needed (with the recorded inputs: 1.4). For " \
+           "1 of them the fitted models predict nearly the same and for 1 of them the outputs " \
+           "leave their recorded range. About 1,600 rows with the recorded inputs, 4 times as " \
+           "many as the 400 of the longest record would be needed" in told  # fmt: skip
 
 
 def test_where_nothing_separates_it_is_said_and_no_file_named():
@@ -368,30 +372,32 @@ def test_where_the_recorded_inputs_do_nothing_else_is_needed():
     found = with_experiment(separation(recorded=6.0, tried=()))
     assert to_decide(found) == [
         RIVALS,
-        "Another 400 rows with the recorded inputs are expected to (expected log-likelihood ratio "
-        "6 nats between the two, 5.4 are enough): no other experiment is needed.",
+        "Another 400 rows with the recorded inputs are expected to distinguish them (expected "
+        "log-likelihood ratio 6 nats between the two, 5.4 are enough): no other experiment is "
+        "needed.",
     ]
-    assert "record as much again" in " ".join(next_steps(found))
+    assert "record as much data again" in " ".join(next_steps(found))
 
 
 def test_without_an_input_to_vary_more_rows_are_the_answer():
     nothing = np.empty((400, 0))
     found = with_experiment(separation(recorded=2.7, tried=(), recorded_inputs=nothing))
     assert to_decide(found)[1:] == [
-        "There is no input to vary: it would take about 800 rows of this kind, 2 times as many as "
-        "the 400 of this record (expected log-likelihood ratio of these: 2.7 nats between the two; "
-        "5.4 are needed)."
+        "There is no input to vary: about 800 rows of this kind, 2 times as many as the 400 of "
+        "this record would be needed (expected log-likelihood ratio "
+        "of this record: 2.7 nats between "
+        "the two; 5.4 are needed)."
     ]
 
 
 def test_of_many_rivals_the_hardest_pair_is_meant():
     three = (("stribeck", "v"), *separation().effects)
     told = to_decide(with_experiment(separation(7.2, effects=three, members=5)))
-    assert told[0] == "These records do not tell stribeck in v, quadratic drag in v and " \
-                      "state-dependent damping in v apart (the first 3 of 5)."  # fmt: skip
-    assert "7.2 nats between the two that are hardest to tell apart, 5.4" in told[1]
+    assert told[0] == "These records do not distinguish stribeck in v, quadratic drag in v and " \
+                      "state-dependent damping in v (the first 3 of 5)."  # fmt: skip
+    assert "7.2 nats between the two that are hardest to distinguish, 5.4" in told[1]
     assert to_decide(effect_found()) == []
-    assert "To decide" not in str(effect_found())
+    assert "do not distinguish" not in str(effect_found())
 
 
 def test_what_does_not_apply_is_told_with_its_reason():
@@ -441,8 +447,8 @@ def test_a_formula_is_told_as_a_suggestion():
         {"equation": "v", "term": "x*u", "coefficient": 0.1234, "se": 0.02, "share": 0.86},
     ]))  # fmt: skip
     text = " ".join(which(found))
-    assert "The nearest formula, a suggestion" in text
-    assert "an increment of v by - 0.31*x**2 + 0.123*x*u in each step" in text
+    assert "Suggested formula" in text
+    assert "add - 0.31*x**2 + 0.123*x*u to v in each step" in text
     assert "86% of the gain of the curves" in text
     assert "formula" not in " ".join(which(none_of_these()))
     assert list(found.tables()["formula"]["term"]) == ["x**2", "x*u"]
@@ -452,13 +458,15 @@ def test_a_formula_is_told_as_a_suggestion():
 def test_how_often_the_first_effect_is_recognised_is_told():
     text = " ".join(how_sure(recovered()))
     assert (
-        "In data simulated with quadratic drag in v on the same inputs, and fitted alike, it came "
-        "first of 2 in 70% of the sets, state-dependent damping in v in 30%." in text
+        "In data sets simulated with quadratic drag in v and the same inputs, and fitted in the "
+        "same way, it came first of 2 effects in 70% of the sets, "
+        "state-dependent damping in v in 30%."
+        in text
     )
     report = recovered()
     sure = report.probabilities.assign(probability=[1.0, 0.0, 0.0, 1.0])
     text = " ".join(how_sure(dataclasses.replace(report, probabilities=sure)))
-    assert "it came first of 2 in 100% of the sets." in text
+    assert "it came first of 2 effects in 100% of the sets." in text
     assert "came first" not in " ".join(how_sure(effect_found()))
     none = dataclasses.replace(report, verdict="none of these")
     assert "came first" not in " ".join(how_sure(none))
@@ -479,4 +487,4 @@ def test_forms_of_one_effect_are_named_once():
     found = separation(7.2, 3.1)
     found = dataclasses.replace(found, effects=(found.effects[0],) * 2)
     told = to_decide(with_experiment(found))
-    assert told[0] == "These records do not tell the forms of quadratic drag in v apart."
+    assert told[0] == "These records do not distinguish the forms of quadratic drag in v."
