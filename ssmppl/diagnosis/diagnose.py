@@ -334,9 +334,9 @@ class _Diagnosis:
         rivals[1:] = sorted(rivals[1:], key=lambda refit: -refit.score)
         longest, why = max(e.steps for e in self.experiments), ""
         if longest > MOST_ROWS:
-            why = f"{longest:,} rows take too long"
+            why = f"the record is too long ({longest:,} rows)"
         elif len(rivals) < 2:
-            why = "that takes fits with likelihoods by a Kalman filter, of two of them at least"
+            why = "this needs fits of at least two of them with likelihoods by a Kalman filter"
         else:
             r.separation = separate(
                 self.augmented, self.trace, list(map(Rival.of, rivals)), len(members),
@@ -345,7 +345,7 @@ class _Diagnosis:
             why = "" if r.separation else "they happen once, or fail under the recorded inputs"
         if why:
             names = " and ".join(str(r.screen.design.candidates[k]) for k in members[:2])
-            self.notes.append(f"no experiment was looked for that would distinguish {names}: {why}")
+            self.notes.append(f"no experiment to distinguish {names} was designed: {why}")
 
     # -- small parts
     def _fit(self, base: Fitter, experiments: Sequence[Experiment]) -> Fit:

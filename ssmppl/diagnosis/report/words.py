@@ -573,8 +573,8 @@ def to_decide(report: Findings) -> list[str]:
                      f"log-likelihood ratio {number(found.best.nats, 2)} nats {pair}{each}, "
                      f"{needed} are enough; with the recorded inputs: {recorded}). The inputs are "
                      "in experiment.csv"),
-            f"The signal keeps {found.best.input} within its recorded range, and the models predict "
-            "that the outputs stay near theirs.",
+            f"The signal keeps {found.best.input} within its recorded range, and the models "
+            "predict that the outputs stay near theirs.",
             f"Without this experiment {_more_rows(found)} would be needed.",
         ]  # fmt: skip
     if found.tried:

@@ -390,10 +390,11 @@ class EffectSelection:
             best = preferred(more, worth)[0]
             if best.score < FORM * chosen.score:
                 out.notes.append(
-                    f"not named: {best.candidates[-1]}, which gains {best.penalised_gain:.1f} nats "
-                    f"beside {' and '.join(map(str, chosen.candidates))}; with simulations further "
-                    f"ahead that is less than {FORM:.0%} of what these gain, by which their "
-                    "formulas may be off"
+                    f"not included: {best.candidates[-1]}, which gains "
+                    f"{best.penalised_gain:.1f} nats in addition to "
+                    f"{' and '.join(map(str, chosen.candidates))}; with the gain in simulations "
+                    f"this is less than {FORM:.0%} of the gain of the latter, and may only correct "
+                    "for their approximate formulas"
                 )
                 return
             column = {c.key: k for k, c in enumerate(self.screen.design.candidates)}

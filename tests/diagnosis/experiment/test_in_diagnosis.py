@@ -63,14 +63,14 @@ def test_where_there_is_nobody_to_compare_it_is_noted(monkeypatch):
     call, found, notes = compared(monkeypatch, alone, [1, 1])
     assert (call, found) == (None, None)
     assert notes[0].startswith(
-        "no experiment was looked for that would distinguish effect 10 and effect 11: that takes "
-        "fits with likelihoods by a Kalman"
+        "no experiment to distinguish effect 10 and effect 11 was designed: this needs fits of at "
+        "least two of them with likelihoods by a Kalman"
     )
     call, _, notes = compared(
         monkeypatch, [refit(10, 2.0), refit(11, 1.0)], [1, 1], rows=MOST_ROWS + 1
     )
     assert call is None
-    assert f"{MOST_ROWS + 1:,} rows take too long" in notes[0]
+    assert f"too long ({MOST_ROWS + 1:,} rows)" in notes[0]
     both = [refit(10, 2.0), refit(11, 1.0)]
     call, found, notes = compared(monkeypatch, both, [1, 1], result=None)
     assert call is not None

@@ -460,8 +460,7 @@ def test_how_often_the_first_effect_is_recognised_is_told():
     assert (
         "In data sets simulated with quadratic drag in v and the same inputs, and fitted in the "
         "same way, it came first of 2 effects in 70% of the sets, "
-        "state-dependent damping in v in 30%."
-        in text
+        "state-dependent damping in v in 30%." in text
     )
     report = recovered()
     sure = report.probabilities.assign(probability=[1.0, 0.0, 0.0, 1.0])
