@@ -73,15 +73,18 @@ def test_the_same_draws():
 
 
 def test_what_stays_joint():
-    """A covariance between components, a prior, and a variance of zero, which Normal has not."""
+    """A covariance between components, and a prior; of a variance of zero there is no Normal, and
+    the component is Dirac."""
     out = ssm.Model("joint")
     out.prior(lambda: {"b": ssm.MvNormal(np.zeros(2), covariance=np.eye(2)), "q": ssm.HalfFlat()})
     out.initial(lambda: {"x": ssm.MvNormal(np.zeros(2), covariance=[[1.0, 0.5], [0.5, 1.0]])})
     out.transition(lambda x, q: {"x": ssm.MvNormal(x, covariance=np.diag([1.0, 0.0]) * q)})
     out.observation(lambda x, b: {"y": ssm.Normal(x[0] + b[0], sd=1.0)})
     found = trace(out)
-    for site in (found.parameters["b"], found.initial["x"], found.transition["x"]):
+    for site in (found.parameters["b"], found.initial["x"]):
         assert isinstance(site.distribution, MvNormal)
+    kinds = {n: type(s.distribution).__name__ for n, s in found.transition.items()}
+    assert kinds == {"x[0]": "Normal", "x[1]": "Dirac"}
     theta = {"b": [0.0, 0.0], "q": 2.0}
     x = ssm.simulate(out, theta, steps=5, draws=3, seed=1)["x"].to_numpy()
     assert np.all(x[:, 1:, 1] == x[:, :-1, 1])
