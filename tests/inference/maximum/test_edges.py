@@ -186,7 +186,8 @@ def test_a_singular_covariance_is_told_to_be_a_dirac():
     model.initial(lambda: {"x": ssm.MvNormal(np.zeros(2), covariance=np.eye(2))})
     model.transition(lambda x, q: {
         "x": ssm.MvNormal(
-            np.stack([0.5 * x[0] + 0.2 * x[1], x[0]]), covariance=q * np.diag([1.0, 0.0])
+            np.stack([0.5 * x[0] + 0.2 * x[1], x[0]]),
+            covariance=q * np.outer([1.0, 0.5], [1.0, 0.5]),
         )
     })  # fmt: skip
     model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
