@@ -74,6 +74,8 @@ def check_values(
     """
     if values is None:
         return {}
+    own = getattr(values, "parameters", None)  # of an Estimate
+    values = own if isinstance(own, Mapping) else values
     if not isinstance(values, Mapping):
         example = ", ".join(f"{n!r}: ..." for n in trace.parameters)
         raise ArgumentError(
@@ -88,10 +90,30 @@ def check_values(
                 f"{argument} names {name!r}, which is {_role(trace, name)}",
                 fix=f"the parameters of the model are: {listing(str(name), trace.parameters)}",
             )
+        if isinstance(value, Mapping):
+            value = _by_label(trace, site, value, argument)
         out[name] = _value(site, value, argument)
     if support:
         _check_supports(trace, out, argument)
     return out
+
+
+def _by_label(trace: Trace, site: Site, given: Mapping[Any, Any], argument: str) -> list[Any]:
+    """Values along the first axis, in order, of a mapping by its labels."""
+    names = trace.component_names
+    dim = next(iter(names.dims.get(site.name, ())), "")
+    labels = names.coords.get(dim, tuple(range(site.shape[0])) if site.shape else ())
+    wrong = [k for k in given if k not in labels] or [k for k in labels if k not in given]
+    if wrong or not labels:
+        known = listing(str(wrong[0]) if wrong else "", [str(k) for k in labels])
+        raise ArgumentError(
+            f"{argument}: parameter {site.name!r} has the keys "
+            f"{', '.join(repr(k) for k in given) or 'none'}",
+            fix=f"give a value for each of {known}"
+            if labels
+            else "give one number, as its prior is scalar",
+        )
+    return [given[k] for k in labels]
 
 
 def _value(site: Site, value: Any, argument: str) -> np.ndarray:

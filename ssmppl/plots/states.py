@@ -140,7 +140,7 @@ def plot_forecast(
     if not is_dataset(result) or not {"draw", "time"} <= set(map(str, result.dims)) \
             or not ("after" in result.attrs or "after" in result.coords):  # fmt: skip
         raise wrong_kind("plot_forecast", result, wanted)
-    if "experiment" in result.dims:
+    if any({"experiment", "time"} <= set(v.dims) for v in result.data_vars.values()):
         label = result["experiment"].values.tolist()[0]
         raise ArgumentError(
             f"plot_forecast draws one experiment, and the forecast is of "

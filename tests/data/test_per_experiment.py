@@ -167,6 +167,7 @@ def test_forecasts_and_predictions_are_of_the_own_values():
     np.testing.assert_allclose(at_end, level, atol=1.0)
     one = ssm.forecast(TREES, idata, inputs=later, experiment="ash", seed=1)
     np.testing.assert_allclose(one["x"].isel(time=-1).mean(), level.sel(experiment="ash"), atol=1.0)
+    assert ssm.plot_forecast(one, idata) is not None
     shuffled = {k: SETS[k] for k in ("ash", "oak", "elm")}
     predicted = ssm.predict(MODEL, idata, shuffled, conditional=False, seed=1)
     means = predicted["posterior_predictive"]["y"].mean(("chain", "draw")).isel(time=4)

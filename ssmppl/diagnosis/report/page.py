@@ -250,7 +250,7 @@ def _unknown(report: Findings) -> str:
     """What could not be decided, and what has to be known before the figures are used."""
     out = ""
     for title, items in (
-        ("Not identifiable", words.undecided(report)),
+        ("Not distinguishable or not applicable", words.undecided(report)),
         ("Notes", [words.sentence(n) for n in report.notes]),
         ("Failed computations", words.left_out(report)),
     ):

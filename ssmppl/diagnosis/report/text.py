@@ -136,7 +136,8 @@ def report_html(report: Findings) -> str:
 def _rest(report: Findings) -> list[tuple[str, list[str]]]:
     """What could not be decided, what would decide it, and what has to be known."""
     found = [
-        ("Not identifiable", words.undecided(report)), ("Next steps", words.next_steps(report)),
+        ("Not distinguishable or not applicable", words.undecided(report)),
+        ("Next steps", words.next_steps(report)),
         ("Notes", [words.sentence(n) for n in report.notes]),
         ("Failed computations", words.left_out(report)),
     ]  # fmt: skip

@@ -58,6 +58,11 @@ def posterior_of(idata: Any, fix: str = "give what ssm.sample returns") -> Any:
     known = hasattr(idata, "groups") or hasattr(idata, "children")
     found = group(idata, "posterior") if known else None
     if found is None:
+        if isinstance(getattr(idata, "parameters", None), Mapping):  # an Estimate
+            fix = (
+                "ssm.simulate(model, estimate, inputs=...) draws at an estimate; for predictions "
+                f"of a posterior {fix}"
+            )
         raise ArgumentError(
             f"idata is {type(idata).__name__} without a group `posterior`",
             fix=fix,

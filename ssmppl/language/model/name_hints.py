@@ -67,6 +67,30 @@ HINTS: dict[str, str] = {
     **dict.fromkeys(["mcmc", "nuts"], "ssm.sample(model, data)"),
     "fit": "ssm.sample(model, data) for a posterior, ssm.maximize(model, data) for an estimate",
     **dict.fromkeys(["mle", "optimize", "optimise"], "ssm.maximize(model, data)"),
+    # MATLAB's System Identification Toolbox
+    **dict.fromkeys(
+        ["pem", "greyest", "nlgreyest", "ssest", "estimate"], "ssm.maximize(model, data)"
+    ),
+    **dict.fromkeys(["idgrey", "idnlgrey", "idss"], 'ssm.Model("name", inputs=("u",))'),
+    "iddata": "ssm.maximize(model, data) with data a DataFrame or a dictionary of arrays; several "
+    "experiments are a dictionary of these",
+    **dict.fromkeys(
+        ["sim", "compare"], "ssm.simulate(model, estimate, inputs=...), a free run"
+    ),
+    "resid": "ssm.kalman_filter(model, data, estimate), of which `y_pit` tests the residuals",
+    "present": "print(ssm.maximize(model, data))",
+    # pomp
+    **dict.fromkeys(["pfilter", "bpfilter"], "ssm.particle_filter(model, data, parameters)"),
+    "pmcmc": "ssm.sample(model, data, ssm.PMMH())",
+    "loglik": "ssm.log_likelihood(model, data, parameters)",
+    "logmeanexp": "np.logaddexp.reduce(found) - np.log(len(found)) of what ssm.log_likelihood "
+    "gives",
+    "coef": "ssm.maximize(model, data).parameters",
+    "panelpomp": 'ssm.Model("name", experiment="unit"), and @model.prior(per="experiment") for '
+    "parameters of each unit",
+    **dict.fromkeys(["eulermultinomial", "eulermultinom", "reulermultinom"],
+        "ssm.Binomial(n, 1 - np.exp(-total * dt)) for all that leave, and ssm.Binomial out of "
+        "these for each destination, whose draws later transition functions read as NAME_next"),
     **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
     **dict.fromkeys(
         ["skewnormal", "skewstudentt", "inversegaussian", "wald", "kumaraswamy",
