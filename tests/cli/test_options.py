@@ -43,7 +43,7 @@ def test_no_verb_is_without_a_command():
     lower = {n for n in ssm.__all__ if n[0].islower() and not n.startswith("plot_")}
     assert lower - {n.replace("-", "_") for n in COMMANDS} == {
         "distribution", "effect", "effects", "plots", "primitive",
-        "expm", "integrate", "repeat", "simulator", "simulators",
+        "expm", "integrate", "repeat", "simulator", "simulators", "structural",
     }  # fmt: skip
 
 

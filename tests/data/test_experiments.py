@@ -101,7 +101,7 @@ def test_log_likelihoods_are_of_the_rows_that_were_measured():
     """Rows without data, or beyond the end of an experiment, counted for ArviZ as observations."""
     method = ssm.MetropolisHastings(log_likelihood=True)
     rows = ssm.sample(TREES, LONG, method, **SHORT)["log_likelihood"]
-    assert rows["y"].dims == ("chain", "draw", "row")
+    assert rows["one_step"].dims == ("chain", "draw", "row")
     assert rows["experiment"].values.tolist() == LONG["tree"].tolist()
     assert rows["time"].values.tolist() == LONG["time"].tolist()
     loo = az.loo(ssm.sample(TREES, LONG, method, **SHORT))
@@ -109,11 +109,11 @@ def test_log_likelihoods_are_of_the_rows_that_were_measured():
     y = np.array([0.3, np.nan, 0.1, -0.2])
     dates = pd.date_range("2024-01-01", periods=4)
     single = ssm.sample(PLAIN, pd.DataFrame({"y": y}, index=dates), method, **SHORT)
-    assert single["log_likelihood"]["y"].shape == (2, 10, 3)
+    assert single["log_likelihood"]["one_step"].shape == (2, 10, 3)
     np.testing.assert_array_equal(single["log_likelihood"]["time"].values, dates[[0, 2, 3]])
     assert single["posterior"]["x"].shape == (2, 10, 4)
     alike = ssm.sample(PLAIN, {k: {"y": np.zeros(3)} for k in "ab"}, method, **SHORT)
-    assert alike["log_likelihood"]["y"].dims == ("chain", "draw", "experiment", "time")
+    assert alike["log_likelihood"]["one_step"].dims == ("chain", "draw", "experiment", "time")
 
 
 def test_all_are_forecast_together(tmp_path):

@@ -79,6 +79,8 @@ def test_a_posterior_mode_at_the_edge():
 def test_what_is_not_identified_is_at_no_edge():
     model = trend("variance")
     model.prior(lambda: {"idle": ssm.HalfFlat()})
+    model.initial(lambda idle: {"unseen": ssm.Normal(idle, sd=1)})
+    model.transition(lambda unseen: {"unseen": ssm.Normal(unseen, sd=1)})
     found = ssm.maximize(model, {"y": steady()}, seed=1, progress=False)
     assert list(found.attrs["held_at_edge"]) == ["s"]
     assert np.isnan(found.standard_errors["q"])
