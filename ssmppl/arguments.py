@@ -52,6 +52,11 @@ OF_VERBS = _aliases(
     ("coolingfraction coolingfraction50", "cooling"),
     ("trace result results posterior", "idata"),
 )  # fmt: skip
+OF_MODELS = _aliases(
+    ("covariates covariate covar covars exog controls u input", "inputs"),
+    ("ts dt deltat sampletime sampling tsample step", "time_step"),
+    ("unit units id group groups panel site subject", "experiment"),
+)
 # Of a distribution only what means the very same. What a name means in one distribution alone
 # follows below, by its class; there, more than the name may have to be written.
 OF_DISTRIBUTIONS = _aliases(
@@ -265,13 +270,26 @@ def checked(function: Function) -> Function:
 
 def checked_settings(kind: Kind) -> Kind:
     """A class of settings whose arguments are checked likewise."""
+    _SETTINGS[kind] = list(inspect.signature(kind).parameters)
+    return _checking(kind, _setting_hint)
+
+
+def checked_model(kind: Kind) -> Kind:
+    """The class of models, whose arguments are checked likewise."""
+    return _checking(kind, _model_hint)
+
+
+def _model_hint(name: str, own: Sequence[str], kind: type) -> str:
+    return _renamed(name, own, OF_MODELS) or _own_arguments(kind.__name__, own)
+
+
+def _checking(kind: Kind, hint: Callable[[str, Sequence[str], Any], str]) -> Kind:
     plain: Callable[..., None] = kind.__init__  # type: ignore[misc]
     signature = inspect.signature(kind)
-    _SETTINGS[kind] = list(signature.parameters)
 
     @functools.wraps(plain)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
-        _check(signature, kind.__name__, args, kwargs, _setting_hint, kind)
+        _check(signature, kind.__name__, args, kwargs, hint, kind)
         plain(self, *args, **kwargs)
 
     kind.__init__ = init  # type: ignore[misc]

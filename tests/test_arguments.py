@@ -8,6 +8,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.arguments import OF_DISTRIBUTIONS, OF_ONE_DISTRIBUTION, OF_VERBS
+from ssmppl.errors import ArgumentError
 from ssmppl.inference.methods import methods
 from ssmppl.language.distributions import Distribution
 
@@ -188,3 +189,14 @@ def test_a_whole_number_is_written_as_one():
     model = ssm.Model("m")
     with pytest.raises(ssm.ArgumentError, match=r"draws=1000.0\nFix: write draws=1000, a whole"):
         ssm.sample(model, {}, draws=1000.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [("Ts", "time_step"), ("covariates", "inputs"), ("covar", "inputs"), ("unit", "experiment"),
+     ("dim", "dims")],
+)  # fmt: skip
+def test_arguments_of_a_model_have_other_names_elsewhere(given, meant):
+    with pytest.raises(ArgumentError, match=f"Model has no argument '{given}'") as error:
+        ssm.Model("name", **{given: ("a",)})
+    assert f"write {meant}=" in str(error.value)

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, overload
 import numpy as np
 
 from ssmppl import markup
+from ssmppl.arguments import checked_model
 from ssmppl.errors import Location, ModelError, UnknownName
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.model.closure_digest import digest_of_code, fingerprint, plain_function
@@ -44,6 +45,7 @@ _OTHER_NAMES = {  # decorators of other libraries
 draw: Callable[[Any], str] | None = None
 
 
+@checked_model
 class Model:
     """A state space model, declared by decorated functions.
 
