@@ -250,6 +250,22 @@ def test_future_rows_are_left_out_of_every_experiment():
     assert scored.sel(experiment=list(SETS)).values.tolist() == [4, 5, 3]
 
 
+def test_updates_are_checked_at_the_values_of_experiments():
+    """1 / K is no number where none of the experiments is meant."""
+    model = ssm.Model("gompertz")
+    model.prior(lambda: {"r": ssm.Normal(0.5, sd=0.5), "q": ssm.InverseGamma(3, scale=0.1)})
+    model.prior(per="experiment")(lambda: {"K": ssm.LogNormal(4, sd=0.5)})
+    model.initial(lambda K: {"n": ssm.LogNormal(np.log(K), sd=0.5)})
+    model.transition(
+        lambda n, r, K, q: {"n": ssm.LogNormal(np.log(n) + r * (1 - n / K), sd=np.sqrt(q))}
+    )
+    model.observation(lambda n: {"y": ssm.LogNormal(np.log(n), sd=0.1)})
+    text = str(ssm.explain(model, [{"y": [30.0, 40.0, 44.0]}, {"y": [100.0, 120.0]}]))
+    assert "could not be checked" not in text
+    assert "r ~ Normal(" in text
+    assert "q ~ inverse Gamma(" in text
+
+
 def joint(model):
     model.prior(per="experiment")(lambda: {"b": ssm.MvNormal(np.zeros(2), covariance=np.eye(2))})
     return {"y": [1.0]}

@@ -24,7 +24,7 @@ from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import Separation, separate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.language.model.trace import Site, previous, seen, symbols
+from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Site, previous, seen, symbols
 
 POINTS = 24
 NEEDED = 5
@@ -184,6 +184,7 @@ def random_series(
     if wide:
         late, spread = rng.choice(_LATE, POINTS), np.abs(rng.choice(_SIZES, POINTS))
         sizes = {s: rng.choice(_SIZES, POINTS) for s in trace.input_symbols}
+    number = rng.integers(0, len(trace.experiments), POINTS) if trace.experiments else None
     for t in range(steps):
         values = dict(parameters)
         values[symbol("time", "t")] = late + t + 1.0
@@ -191,6 +192,8 @@ def random_series(
         for name, shape in trace.inputs.items():
             for s in symbols("input", name, shape).ravel():
                 values[s] = rng.uniform(0.3, 2.0, POINTS) * sizes.get(s, 1.0)
+        if number is not None:
+            values[symbol("input", EXPERIMENT_NUMBER)] = number.astype(float)
         if t > 0:
             last = rows[-1]
             for s in [*trace.state_symbols, *trace.observation_symbols, *trace.input_symbols]:
