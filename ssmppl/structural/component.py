@@ -25,13 +25,16 @@ DIFFUSE = "ssm.Flat()"
 class Component:
     """A part of a structural model: what the functions in this module return.
 
+    Parameters
+    ----------
     name : by which the model, `observe` and `plot_components` know it.
     kind : "level", "trend", "seasonal", "cycle", "regression", "intervention", "autoregression";
         of a sum that is observed, "observation".
     states, parameters, inputs : their names.
     value : what it adds to the mean of an observation, as Python in these names (and `t`).
     text : its functions, as they stand in the model.
-    diffuse : whether a state of it has a flat start. reads_time : whether `value` reads `t`.
+    diffuse : whether a state of it has a flat start.
+    reads_time : whether `value` reads `t`.
     link : of an observation, the scale of its mean on which `value` is: "identity", "log", "logit".
     """
 

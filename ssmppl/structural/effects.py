@@ -111,7 +111,7 @@ def intervention(
 
     Returns
     -------
-    Component
+    Component : to be handed to `observe` and `plot_components`.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def autoregression(
 
     Returns
     -------
-    Component
+    Component : to be handed to `observe` and `plot_components`.
 
     Raises
     ------

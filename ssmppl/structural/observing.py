@@ -49,7 +49,7 @@ def observe(
     ----------
     model : it is written into this.
     channel : name of the observed quantity, as the data have it.
-    components : what is summed, each by itself or by its name; in the docstring of `Component`,
+    *components : what is summed, each by itself or by its name; in the docstring of `Component`,
         `value`.
     distribution : "normal", with the sum for its mean; "student_t", for data with outliers, with
         the sum for its location; "poisson" and "negative_binomial", of counts, with the sum for the

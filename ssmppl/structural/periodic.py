@@ -46,7 +46,7 @@ def seasonal(
 
     Returns
     -------
-    Component
+    Component : to be handed to `observe` and `plot_components`.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def cycle(
 
     Returns
     -------
-    Component
+    Component : to be handed to `observe` and `plot_components`.
 
     Raises
     ------

@@ -35,7 +35,7 @@ def level(model: Any, *, sd: Any = None, initial: Any = None, name: str = "level
 
     Returns
     -------
-    Component
+    Component : to be handed to `observe` and `plot_components`.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def trend(
 
     Returns
     -------
-    Component
+    Component : to be handed to `observe` and `plot_components`.
 
     Raises
     ------

@@ -404,7 +404,7 @@ def compile(model: Model, data: Any = None) -> Program:
 
     Returns
     -------
-    Program : `.source()` is its text, `.path` its file.
+    Program : ``.source()`` is its text, ``.path`` its file.
 
     Raises
     ------

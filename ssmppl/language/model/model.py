@@ -336,8 +336,14 @@ class Model:
         return function
 
     def begin(self) -> Execution:
-        """The run of a cell or a module that declares something now; what an earlier run of the
-        same has declared is forgotten."""
+        """Forget what an earlier run of the cell or module that declares something has declared.
+
+        Called by what writes into a model, as `ssm.structural`; the decorators do it themselves.
+
+        Returns
+        -------
+        Execution : the run that goes on now.
+        """
         now = this_execution()
         self._forget(lambda role, old, then: now.outdates(then))
         return now

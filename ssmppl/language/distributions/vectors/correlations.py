@@ -35,15 +35,15 @@ class LKJ(Joint):
         identity are, below it those near singular ones. One correlation alone is ``2 B - 1`` with B
         of distribution ``Beta(b, b)``, b = eta + dim / 2 - 1.
 
+    Raises
+    ------
+    ModelError : dim is no whole number from 2 on; eta is no positive number.
+
     Notes
     -----
     Lewandowski, Kurowicka and Joe (2009), with the normalising constant of their equation (16). It
     is `LKJCorr` of PyMC and NumPyro, `lkj_corr` of Stan. Its Cholesky factor, `LKJCholesky` there,
     is ``np.linalg.cholesky(R)``.
-
-    Raises
-    ------
-    ModelError : dim is no whole number from 2 on; eta is no positive number.
     """
 
     symmetric = unit_diagonal = True

@@ -37,17 +37,17 @@ class Ordered(Joint):
         ``Normal(np.zeros(3), sd=5)``; or (R, K), each row in increasing order. Where components
         have different distributions these are given as numbers, and nothing can be drawn from it.
 
+    Raises
+    ------
+    ModelError : `law` is no continuous distribution of independent components, has no two of them,
+        or has some of different distributions of parameters, or of different supports.
+
     Notes
     -----
     The posterior is that of Stan's `ordered` and `positive_ordered` and of PyMC's
     ``transform=ordered``, whose densities lack the probability of the order, as it is constant.
     Draws from the prior are in order, as are not those of PyMC's `sample_prior_predictive`. Order
     statistics: David and Nagaraja (2003), "Order statistics", chapter 2.
-
-    Raises
-    ------
-    ModelError : `law` is no continuous distribution of independent components, has no two of them,
-        or has some of different distributions of parameters, or of different supports.
     """
 
     prior_only = True
