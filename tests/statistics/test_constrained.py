@@ -29,7 +29,13 @@ PAIRS = [
 ]
 STUDIES = {s.name: s for name, m in PAIRS for s in [Study(name, m, *PARAMETERS[name])]}
 QUANTITIES = sum(len(s.ranked) for s in STUDIES.values())
-LONG = {n for n, s in STUDIES.items() if isinstance(s.method, (ssm.ISMCMC, ssm.PMMH))}
+SHORT = {
+    s.name
+    for s in STUDIES.values()
+    if s.name.startswith("ordered_levels")
+    and isinstance(s.method, (ssm.Gibbs, ssm.MetropolisHastings))
+} | {"ordered_counts PGAS"}
+LONG = set(STUDIES) - SHORT  # minutes each; the moments below are of all methods
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
 
 
