@@ -575,7 +575,7 @@ def test_a_step_forward_counts_what_it_adds(monkeypatch, promised, ahead, taken,
     choice_of(screen, settings=SimpleNamespace(particles=1))._forward(out, 2)
     assert (len(out.chosen.candidates) == 2) is bool(taken)
     assert out.notes[:1] == ["not refitted: it failed"] * (taken is not None)
-    assert ["gains 20.0 nats beside" in n for n in out.notes[1:]] == [True] * told
+    assert ["gains 20.0 nats in addition to" in n for n in out.notes[1:]] == [True] * told
     if taken:
         assert (out.chosen.gain, out.chosen.ahead) == (70.0, ahead)
 
