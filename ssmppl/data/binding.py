@@ -19,7 +19,7 @@ from ssmppl.counts import check_count
 from ssmppl.data.channels import channel, holds
 from ssmppl.data.defined import check_defined
 from ssmppl.data.parameters import pack
-from ssmppl.data.per_experiment import with_experiment_number
+from ssmppl.data.per_experiment import experiment_number
 from ssmppl.data.sources import Source, sources
 from ssmppl.data.time_steps import with_time_step
 from ssmppl.data.values import name_of, number, outside
@@ -81,9 +81,11 @@ def bind(
         {n: site.distribution.support() for n, site in trace.observations.items()},
         tuple(_needed(trace)),
     )
-    found = [with_time_step(trace, s) for s in sources(data, named, by=trace.experiment)]
-    given = [with_experiment_number(trace, s, k) for k, s in enumerate(found)]
-    return [_bind(trace, s, need_observations, steps, common) for s in given]
+    given = [with_time_step(trace, s) for s in sources(data, named, by=trace.experiment)]
+    return [
+        _bind(trace, s, need_observations, steps, common, experiment_number(trace, s, k))
+        for k, s in enumerate(given)
+    ]
 
 
 def unread(trace: Trace, data: Any) -> dict[str, Any]:
@@ -141,8 +143,7 @@ def bind_inputs(
     values = {n: channel(source, n, shape, "input") for n, shape in trace.given_inputs.items()}
     rows = _rows(source, values, steps)
     _check_inputs(source, values)
-    values[EXPERIMENT_NUMBER] = np.full(rows, number)
-    return _input_array(trace, values, rows), rows, source
+    return _input_array(trace, values, rows, number), rows, source
 
 
 def _to_give(trace: Trace) -> list[str]:
@@ -160,9 +161,9 @@ class _Common:
 
 
 def _bind(
-    trace: Trace, source: Source, need: bool, steps: int | None, common: _Common
+    trace: Trace, source: Source, need: bool, steps: int | None, common: _Common, number: float
 ) -> Experiment:
-    inputs = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
+    inputs = {n: channel(source, n, shape, "input") for n, shape in trace.given_inputs.items()}
     observed = {}
     for name, site in trace.observations.items():
         if need or holds(source, name, site.shape):
@@ -171,7 +172,7 @@ def _bind(
     for name, site in trace.observations.items():
         observed.setdefault(name, np.full((rows, *site.shape), np.nan))
     _check_inputs(source, inputs)
-    u = _input_array(trace, inputs, rows)
+    u = _input_array(trace, inputs, rows, number)
     env = dict(zip(trace.input_symbols, u.T, strict=True))
     env[symbol("time", "t")] = np.arange(1.0, rows + 1.0)
     partial = {
@@ -192,7 +193,7 @@ def _bind(
         steps=rows,
         partial=frozenset(partial),
         observed={n: observed[n] for n in trace.observations},
-        inputs={n: inputs[n] for n in trace.given_inputs},
+        inputs=inputs,
         zone=source.zone,
         label=source.experiment,
     )
@@ -252,7 +253,11 @@ def _check_inputs(source: Source, inputs: dict[str, np.ndarray]) -> None:
             )
 
 
-def _input_array(trace: Trace, inputs: dict[str, np.ndarray], rows: int) -> np.ndarray:
+def _input_array(
+    trace: Trace, inputs: dict[str, np.ndarray], rows: int, number: float
+) -> np.ndarray:
+    """(T, U). number : that of the experiment, an input where parameters are of each."""
+    inputs = inputs | {EXPERIMENT_NUMBER: np.full(rows, number)}
     columns = [inputs[n].reshape(rows, -1) for n in trace.inputs]
     return np.ascontiguousarray(np.concatenate([np.zeros((rows, 0)), *columns], axis=1))
 

@@ -92,7 +92,7 @@ def check_values(
             )
         if isinstance(value, Mapping):
             value = _by_label(trace, site, value, argument)
-        out[name] = _value(site, value, argument)
+        out[name] = _value(site, value, argument, name in trace.per_experiment)
     if support:
         _check_supports(trace, out, argument)
     return out
@@ -116,7 +116,7 @@ def _by_label(trace: Trace, site: Site, given: Mapping[Any, Any], argument: str)
     return [given[k] for k in labels]
 
 
-def _value(site: Site, value: Any, argument: str) -> np.ndarray:
+def _value(site: Site, value: Any, argument: str, per_experiment: bool) -> np.ndarray:
     array = as_numbers(value)
     shape = f"of shape {site.shape}" if site.shape else "number"
     if isinstance(array, Fault):
@@ -127,11 +127,14 @@ def _value(site: Site, value: Any, argument: str) -> np.ndarray:
             fix=f"give an array {shape}" if site.shape else "give a number",
         )
     if array.shape != site.shape:
+        fix = f"give an array {shape}, the shape of its prior"
+        if not site.shape:
+            fix = "give one number, as its prior is scalar"
+        if per_experiment:
+            fix = f"{fix}; each experiment has its own: give those of the experiments in the data"
         raise ArgumentError(
-            f"{argument}: parameter {site.name!r} has shape {array.shape}: {short(value)}",
-            fix=f"give an array {shape}, the shape of its prior" if site.shape
-            else "give one number, as its prior is scalar",
-        )  # fmt: skip
+            f"{argument}: parameter {site.name!r} has shape {array.shape}: {short(value)}", fix=fix
+        )
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ArgumentError(

@@ -3,16 +3,13 @@ model over the experiments of some data, and in each data set the number of its 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from ssmppl.data.experiments import EXPERIMENT, split
 from ssmppl.data.sources import Source
 from ssmppl.errors import DataError, listing
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Trace
+from ssmppl.language.model.trace import Trace
 from ssmppl.language.tracing import trace
 
 
@@ -33,29 +30,22 @@ def trace_over(model: Model, data: Any) -> Trace:
     return trace(model, tuple(_label(label, k) for k, (label, _) in enumerate(parts)))
 
 
-def trace_of_results(model: Model, group: Any) -> Trace:
-    """The trace over the experiments that results (a group of them) are of."""
-    traced = trace(model)
-    own = [n for n in traced.per_experiment if n in group and EXPERIMENT in group[n].dims]
-    if not own:
-        return traced
-    return trace(model, tuple(group[own[0]][EXPERIMENT].values.tolist()))
+def trace_of_results(model: Model, group: Any, data: Any = None) -> Trace:
+    """The trace over the experiments that results (a group of them) are of; of results without
+    that dim over those in `data`."""
+    if EXPERIMENT not in getattr(group, "dims", ()) or not trace(model).per_experiment:
+        return trace_over(model, data)
+    return trace(model, tuple(group[EXPERIMENT].values.tolist()))
 
 
-def with_experiment_number(trace: Trace, source: Source, k: int) -> Source:
-    """The data set, the k-th, with the number of its experiment in each row.
+def experiment_number(trace: Trace, source: Source, k: int) -> float:
+    """That of the k-th data set; 0 where no parameters are of each experiment.
 
     Raises
     ------
     DataError : its label is none of those that the parameters are of.
     """
-    if not trace.experiments or EXPERIMENT_NUMBER in source.columns:
-        return source
-    number = number_of(trace, _label(source.experiment, k))
-    rows = max([len(np.atleast_1d(v)) for v in source.columns.values()], default=0)
-    rows = len(source.time) if source.time is not None else rows
-    column = np.full(rows, float(number))
-    return replace(source, columns={**source.columns, EXPERIMENT_NUMBER: column})
+    return float(number_of(trace, _label(source.experiment, k))) if trace.experiments else 0.0
 
 
 def number_of(trace: Trace, label: Any) -> int:

@@ -111,7 +111,7 @@ def _moving(values: dict[str, np.ndarray], names: list[str], var_names: Any) -> 
 def _priors(idata: Any, prior: Any) -> dict[str, Prior]:
     if isinstance(prior, Model):
         posterior = group(idata, "posterior") if is_inference_data(idata) else None
-        return priors_of(trace_of_results(prior, {} if posterior is None else posterior))
+        return priors_of(trace_of_results(prior, posterior))
     found = None
     source = idata if prior is None else prior
     if is_inference_data(source):

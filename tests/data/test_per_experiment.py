@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import pickle
+
 import arviz as az
 import numpy as np
 import pandas as pd
 import pytest
 
 import ssmppl as ssm
-from ssmppl.errors import DataError, ModelError
+from ssmppl.errors import ArgumentError, DataError, ModelError
 
 SHARED = {"mu": 0.5, "q": 0.3}
 OWN = {"oak": -20.0, "elm": 3.0, "ash": 30.0}
@@ -183,7 +185,7 @@ def test_what_only_priors_hold_is_not_estimated_by_the_likelihood():
     found = ssm.maximize(TREES, LONG, seed=1, progress=False)
     assert found.attrs["only_in_priors"] == ["mu"]
     assert "mu" not in found.standard_errors
-    assert "mu: only priors depend on it" in str(found)
+    assert "mu: held where the search began, as only priors depend on it" in str(found)
     assert np.isfinite(found.standard_errors["b"]).all()
     whole = ssm.maximize(TREES, LONG, objective="posterior", seed=1, progress=False)
     assert "only_in_priors" not in whole.attrs
@@ -229,6 +231,32 @@ def test_a_prior_declared_again_for_each_experiment_counts():
     own = ssm.maximize(model, data, seed=1, progress=False).parameters["b"]
     alone = [ssm.maximize(model, d, seed=1, progress=False).parameters["b"] for d in data]
     np.testing.assert_allclose(own, alone, rtol=1e-6)
+
+
+def test_other_columns_may_have_other_lengths():
+    more = {k: {**v, "remarks": np.arange(50)} for k, v in SETS.items()}
+    assert ssm.log_likelihood(MODEL, more, THETA)[0] == ssm.log_likelihood(MODEL, SETS, THETA)[0]
+
+
+def test_held_values_of_each_experiment_go_into_forecasts():
+    held = {n: THETA[n] for n in ("b", "c")}
+    idata = ssm.sample(
+        TREES, LONG, fixed=held, draws=20, warmup=20, chains=2, seed=1, progress=False
+    )
+    ahead = ssm.forecast(TREES, idata, inputs={"w": np.zeros(40)}, seed=1)
+    np.testing.assert_allclose(
+        ahead["x"].isel(time=-1).mean("draw"), np.array(list(OWN.values())) / 0.2, atol=1.0
+    )
+
+
+def test_values_of_all_experiments_are_not_those_of_one():
+    with pytest.raises(ArgumentError, match="those of the experiments in the data"):
+        ssm.log_likelihood(MODEL, {"elm": SETS["elm"]}, THETA)
+
+
+def test_a_pickled_model_has_them():
+    other = pickle.loads(pickle.dumps(MODEL))
+    assert ssm.log_likelihood(other, SETS, THETA)[0] == ssm.log_likelihood(MODEL, SETS, THETA)[0]
 
 
 def test_a_single_data_set_has_plain_parameters():

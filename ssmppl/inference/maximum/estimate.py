@@ -132,11 +132,10 @@ class Estimate:
             out.append(str(self.attrs["approximate_distributions"]))
         if idle := self.attrs.get("only_in_priors"):
             out.append(
-                f"{', '.join(idle)}: only priors depend on {'it' if len(idle) == 1 else 'them'}, "
-                "so that the likelihood says nothing and the value is none of the data's; "
-                'objective="posterior", ssm.sample, or a state with that distribution in @initial '
-                "and Dirac of itself in @transition in place of the parameter would estimate "
-                f"{'it' if len(idle) == 1 else 'them'}"
+                f"{', '.join(idle)}: held where the search began, as only priors depend on "
+                f"{'it' if len(idle) == 1 else 'them'} and the likelihood does not; ssm.sample "
+                "estimates such parameters, and so does ssm.maximize where what they are of is a "
+                "state, with that distribution in @initial and Dirac of itself in @transition"
             )
         if self.attrs.get("interrupted"):
             out.append("interrupted; this is the best point so far")

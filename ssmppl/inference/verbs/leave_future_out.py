@@ -43,6 +43,7 @@ from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.inference.verbs.predict import all_draws, parameters_of, posterior_of
 from ssmppl.inference.verbs.sample import sample
 from ssmppl.language.model.model import Model
+from ssmppl.language.model.trace import Trace
 from ssmppl.results import arviz, to_dataset
 
 if TYPE_CHECKING:
@@ -148,12 +149,7 @@ def leave_future_out(
             fresh = not shape <= threshold  # NaN is none to trust
         if fresh:
             with noticed():  # of the rows before t a channel may have none
-                own = bool(problem.trace.experiments)
-                known = [
-                    _until(e, b[t])
-                    for e, b in zip(experiments, together.before, strict=True)
-                    if b[t] or own
-                ]
+                known = _known(problem.trace, experiments, [int(b[t]) for b in together.before])
                 idata = sample(model, known, seed=_number(seeds, refits), **settings)
             posterior = posterior_of(idata)
             if posterior.attrs["interrupted"]:  # a part of its draws, where nobody asked for it
@@ -255,6 +251,14 @@ def _efficiency(posterior: Any) -> float:
     found = arviz().ess(posterior, method="mean")
     least = min((float(found[n].min()) for n in found.data_vars), default=float(total))
     return min(1.0, least / total) if np.isfinite(least) else 1.0
+
+
+def _known(trace: Trace, experiments: Sequence[Experiment], rows: Sequence[int]) -> Any:
+    """So many first rows of each as `sample` takes them: those that have any, by label."""
+    own = bool(trace.experiments)
+    parts = [(e.label, _until(e, n)) for e, n in zip(experiments, rows, strict=True) if n or own]
+    labelled = all(label is not None for label, _ in parts)
+    return dict(parts) if labelled else [part for _, part in parts]
 
 
 def _until(whole: Experiment, rows: int) -> dict[str, np.ndarray]:

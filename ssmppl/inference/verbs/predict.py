@@ -32,7 +32,6 @@ from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.simulate import check_drawable, check_finite, check_samplers, feeds_back
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
-from ssmppl.language.tracing import trace
 from ssmppl.results import to_inference_data
 
 # Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.
@@ -164,7 +163,7 @@ def predict(
     ------
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
     """
-    traced = trace_over(model, data) if data is not None else trace(model)
+    traced = trace_over(model, data)
     if not traced.observations:
         raise ModelError(
             f"model {traced.name!r} has no @observation function: there is nothing to predict",
@@ -178,7 +177,7 @@ def predict(
             "give what ssm.sample returns, or None to draw from the prior; data come third, "
             "ssm.predict(model, None, data)",
         )
-        traced = trace_of_results(model, posterior)
+        traced = trace_of_results(model, posterior, data)
     if data is None and steps is None:
         raise ArgumentError(
             "neither data nor steps tell how many rows to predict",

@@ -211,8 +211,7 @@ class Model:
         Parameters
         ----------
         function : returns the distributions of states by name, all of them or some; its arguments
-            are parameters,
-            inputs and ``t``.
+            are parameters, inputs and ``t``.
 
         Returns
         -------
@@ -418,7 +417,7 @@ class Model:
             rows.insert(0, (markup.text("inputs"), markup.code(", ".join(lengths)), ""))
         if not rows:
             return markup.heading(self.name) + markup.paragraph("Nothing is declared yet.")
-        head = ("law", "depends on", "declared at")
+        head = ("function", "depends on", "declared at")
         found = markup.heading(self.name) + self._picture()
         found += markup.table(rows, head, left=(0, 1, 2))
         source = "\n\n".join(t for t in texts if t)
