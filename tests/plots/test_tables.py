@@ -63,9 +63,9 @@ def test_tables_bring_no_colours_and_ask_for_nothing(name):
     assert len(found) < 20_000
 
 
-def test_a_model_shows_its_laws_and_where_they_stand():
+def test_a_model_shows_its_functions_and_where_they_stand():
     read = Read(level._repr_html_())
-    assert ["law", "depends on", "declared at"] in read.rows
+    assert ["function", "depends on", "declared at"] in read.rows
     assert ["inputs", "push", ""] in read.rows
     (row,) = [r for r in read.rows if r[0] == "transition"]
     assert row[1] == "x, q, push"
