@@ -128,6 +128,7 @@ _VANISHING = {"exp", "ndtr", "erf", "erfc"}
 # Piecewise constant: derivative zero wherever there is one.
 FLAT = BOOLEAN | {"sign", "floor", "ceil"}
 JUMPING = FLAT | {"mod"}  # not continuous
+BENT = JUMPING | {"where", "maximum", "minimum", "abs"}  # or without a derivative somewhere
 LONGEST = 80  # characters of an expression in an error
 
 
@@ -136,6 +137,13 @@ def jumps(node: Expr) -> bool:
     if node.op == "loop":
         return any(map(jumps, topological(node.data.update)))
     return node.op in JUMPING
+
+
+def bends(node: Expr) -> bool:
+    """Whether an operation has corners or is not continuous, or a loop makes one that does."""
+    if node.op == "loop":
+        return any(map(bends, topological(node.data.update)))
+    return node.op in BENT
 
 
 class NotDifferentiable(SSMError):

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssmppl.expressions.calculus import JUMPING, NotDifferentiable, differentiate
+from ssmppl.expressions.calculus import NotDifferentiable, bends, differentiate
 from ssmppl.expressions.expr import (
     Expr,
     apply,
@@ -26,7 +26,6 @@ from ssmppl.expressions.loops.loop import fresh, repeated
 Matrix = np.ndarray  # of nodes
 TERMS = 16  # of the series of an exponential
 MOST_HALVINGS = 60.0
-_BENT = JUMPING | {"where", "maximum", "minimum", "abs"}
 
 
 def affine_form(
@@ -43,16 +42,10 @@ def affine_form(
     if any(depends_on(e, symbols) for e in rows.ravel()):
         return None
     if any(
-        _bends(n) and depends_on(n, symbols) for n in topological(list(update))
+        bends(n) and depends_on(n, symbols) for n in topological(list(update))
     ):  # a step is flat too, and has another value elsewhere
         return None
     return rows, substitute(list(update), dict.fromkeys(symbols, constant(0.0)))
-
-
-def _bends(node: Expr) -> bool:
-    if node.op == "loop":
-        return any(map(_bends, topological(node.data.update)))
-    return node.op in _BENT
 
 
 def numbers_of(matrix: Matrix) -> np.ndarray | None:

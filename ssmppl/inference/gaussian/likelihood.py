@@ -24,6 +24,8 @@ class LaplaceLikelihood:
     unless there are several.
     """
 
+    title, jumps = "Laplace's approximation", False
+
     def __init__(self, problem: Problem, approximation: GaussianApproximation):
         self.problem, self.approximation = problem, approximation
         self.modes: list[Mode | None] = []
@@ -64,6 +66,29 @@ class LaplaceLikelihood:
                 return value, gradient
             total += one
         return value, total
+
+
+class ExtendedLikelihood:
+    """The extended Kalman filter's log p(y | theta), summed over the experiments; without a
+    gradient and modes, and where a filtered mean meets a corner of the model it may jump."""
+
+    title, jumps = "the extended Kalman filter's approximation", True
+    differentiable = False
+
+    def __init__(self, problem: Problem, approximation: GaussianApproximation):
+        self.problem, self.approximation = problem, approximation
+        self.modes: list[Mode | None] = [None] * len(problem.experiments)
+
+    def forget(self) -> None:
+        """It remembers nothing."""
+
+    def __call__(self, theta: np.ndarray) -> float:
+        """The approximate log-likelihood at theta (P,); -inf where it is not finite."""
+        return approximate_log_likelihood(self.problem, theta, self.approximation, "extended")
+
+    def score(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
+        """(value, NaN (P,)): it has no gradient."""
+        return self(theta), np.full(len(theta), np.nan)
 
 
 def use_mode(problem: Problem, theta: np.ndarray) -> None:

@@ -32,7 +32,7 @@ from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximization
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
-from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
+from ssmppl.inference.maximum.gaussian_climb import climb_gaussian
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.parts import Parts, parts_of, summed
@@ -76,7 +76,7 @@ def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
         found = laplace_approximation(setup.problem)
         if method.laplace and not isinstance(found, NotApplicable):
             with announced("DirectOptimization", "maximising the likelihood", shown=setup.progress):
-                return GaussianClimb(setup, method, found).run()
+                return climb_gaussian(setup, method, found)
         reason = smooth_filter_applies(setup.problem.trace)
         if reason is not None:
             raise ArgumentError(

@@ -6,6 +6,11 @@ millisecond. What it lacks, log Z - L, is estimated by twisted particle filters 
 numbers, seed by seed, at the ends of the ellipsoid of one standard deviation round its top: there
 it is small and nearly straight. Its slopes move the top and its curvature the information, until
 the top rests. The slopes' scatter over the seeds gives the estimate's Monte Carlo error.
+
+Where a transition or an observation has corners, as dry friction, a stop or a dead zone makes them,
+the likeliest trajectory leans against them, and Laplace's L has jumps in the parameters. The
+extended Kalman filter's, which linearises about each filtered mean, has fewer and smaller ones: it
+is L there, and its differences are taken over a standard deviation too, so that they go out.
 """
 
 from __future__ import annotations
@@ -22,7 +27,10 @@ from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.codegen.store.beforehand import beforehand
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood, use_mode
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.calculus import bends
+from ssmppl.expressions.expr import dependent, symbols_of
+from ssmppl.inference.gaussian.likelihood import ExtendedLikelihood, LaplaceLikelihood, use_mode
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.edges import Edges, edges
 from ssmppl.inference.methods.methods import DirectOptimization
@@ -40,6 +48,7 @@ from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
+from ssmppl.language.model.trace import Trace
 
 REACH = 1.0  # standard deviations by which the points lie off the top
 FINE = 0.02  # and those of the differences that give the slope of L
@@ -55,9 +64,53 @@ FEWEST = 50  # particles
 KNOWN = 1e-4  # information in z from which a direction is looked into: a standard error of 100
 FURTHER = 2  # starts more, where a climb has not come to a top
 
+Approximate = LaplaceLikelihood | ExtendedLikelihood
+
+
+def climb_gaussian(
+    setup: Maximization, method: DirectOptimization, found: GaussianApproximation
+) -> Ascent:
+    """The ascent by Laplace's log-likelihood; by the extended Kalman filter's where the model has
+    corners. Where one comes to no top the other is tried, and the better of them returned.
+
+    Raises
+    ------
+    ArgumentError : neither is finite at any point tried for a start.
+    """
+    problem = setup.problem
+    order: list[Approximate] = [
+        LaplaceLikelihood(problem, found), ExtendedLikelihood(problem, found)
+    ]  # fmt: skip
+    bent = has_corners(problem.trace)
+    if bent:
+        order.reverse()
+    ends: list[Ascent] = []
+    for approximate in order:
+        one = GaussianClimb(setup, method, approximate)
+        try:
+            end = one.run()
+        except ArgumentError:
+            if approximate is order[-1] and not ends:
+                raise
+            continue
+        if end.interrupted or end.report["converged"] or (one.arrived and not bent):
+            return end
+        ends.append(end)
+    return max(ends, key=lambda end: bool(end.report["converged"]))
+
+
+def has_corners(trace: Trace) -> bool:
+    """Whether a transition or an observation depends on states by corners or jumps."""
+    sites = [*trace.transition.values(), *trace.observations.values()]
+    roots = [e for s in sites for a in s.distribution.parameters.values() for e in array(a).ravel()]
+    moving = [s for s in symbols_of(roots) if s.data[0] in ("state", "state_prev")]
+    return any(map(bends, dependent(roots, moving)))
+
 
 class GaussianClimb:
-    """Ascent of Laplace's log-likelihood, and its correction.
+    """Ascent of an approximate log-likelihood, and its correction.
+
+    arrived : whether `run` came to a top of it.
 
     Raises
     ------
@@ -65,10 +118,10 @@ class GaussianClimb:
     """
 
     def __init__(
-        self, setup: Maximization, method: DirectOptimization, found: GaussianApproximation
+        self, setup: Maximization, method: DirectOptimization, approximate: Approximate
     ):
-        self.setup, self.method = setup, method
-        self.laplace = LaplaceLikelihood(setup.problem, found)
+        self.setup, self.method, self.approximate = setup, method, approximate
+        self.arrived = False
         self.evaluations = 0
         self.best, self.best_value = np.empty(0), -np.inf  # of all points looked at
         self.iterates: list[np.ndarray] = []
@@ -88,8 +141,9 @@ class GaussianClimb:
         self.iterates.append(self._theta(top.z))
         report = {
             "converged": top.distance < GOOD, "evaluations": self.evaluations,
-            "likelihood": "Laplace's approximation", "restarts": started - 1,
+            "likelihood": self.approximate.title, "restarts": started - 1,
         }  # fmt: skip
+        self.arrived = bool(report["converged"] and np.all(np.isfinite(information)))
         if not np.all(np.isfinite(information)):
             return self._uncorrected(top.z, None, report, "it has no second derivatives at its top")
         held = None
@@ -110,10 +164,10 @@ class GaussianClimb:
             return self._uncorrected(top.z, information, report, found)
         report |= {
             "converged": report["converged"] and found.rests, "evaluations": self.evaluations,
-            "likelihood": "Laplace's approximation, corrected by twisted particle filters with "
+            "likelihood": f"{self.approximate.title}, corrected by twisted particle filters with "
             f"common random numbers ({found.particles} particles, {self.method.averages} seeds)",
             "log_likelihood_error": found.value_error,
-            "laplace_log_likelihood": found.laplace,
+            "approximate_log_likelihood": found.approximate,
         }  # fmt: skip
         self.iterates.append(self._theta(found.z))
         return Ascent(
@@ -125,7 +179,9 @@ class GaussianClimb:
     def _later(self) -> tuple[Callable[[], object], ...]:
         """What the climb comes to, and its correction, for another process to compile."""
         problem, theta = self.setup.problem, self.setup.space.theta
-        calls: list[Callable[[], object]] = [partial(use_mode, problem, theta)]
+        calls: list[Callable[[], object]] = []
+        if isinstance(self.approximate, LaplaceLikelihood):
+            calls.append(partial(use_mode, problem, theta))
         if isinstance(problem.program.twisted, TwistedFilter):
             sets = range(len(problem.experiments))
             streams = [random_state(np.random.SeedSequence(0), i) for i in sets]
@@ -144,12 +200,12 @@ class GaussianClimb:
 
     def _rests(self, z: np.ndarray, information: np.ndarray) -> bool:
         """Whether the quadratic expects next to nothing in the directions of which it knows."""
-        slope = self.slope(z)[1] if self.laplace.differentiable else np.full(len(z), np.nan)
+        slope = self.slope(z)[1] if self.approximate.differentiable else np.full(len(z), np.nan)
         along = slope @ axes_of(information)
         return bool(0.5 * along @ along < GOOD)
 
     def objective(self, z: np.ndarray) -> float:
-        """Laplace's log-likelihood at z (F,), with the prior where it counts."""
+        """The approximate log-likelihood at z (F,), with the prior where it counts."""
         value = self.log_likelihood(z)
         if value > -np.inf:
             value += self.setup.log_prior(z)
@@ -163,7 +219,7 @@ class GaussianClimb:
         point = self.setup.transform.at(z)
         if point.log_prior == -np.inf:
             return -np.inf, np.full(len(z), np.nan)
-        value, gradient = self.laplace.score(point.theta)
+        value, gradient = self.approximate.score(point.theta)
         slope = point.pull(gradient)
         if self.setup.with_prior:
             value, slope = value + point.log_prior, slope + point.d_log_prior
@@ -174,17 +230,17 @@ class GaussianClimb:
     def information(self, z: np.ndarray) -> np.ndarray:
         """(F, F) minus the second derivatives of the objective at z (F,); NaN where there are
         none."""
-        if self.laplace.differentiable:
+        if self.approximate.differentiable:
             found = information_by_slope(self.slope, z)
             if np.all(np.isfinite(found)):
                 return found
         return information_at(self.objective, z)
 
     def log_likelihood(self, z: np.ndarray) -> float:
-        """Laplace's; -inf off the support."""
+        """The approximation's; -inf off the support."""
         self.evaluations += 1
         theta, log_prior = self.setup.space.parameters(z)
-        return self.laplace(theta) if log_prior > -np.inf else -np.inf
+        return self.approximate(theta) if log_prior > -np.inf else -np.inf
 
     def _theta(self, z: np.ndarray) -> np.ndarray:
         return self.setup.space.parameters(z)[0].copy()
@@ -192,7 +248,7 @@ class GaussianClimb:
     def _climb(self, z: np.ndarray) -> Top | None:
         """The top near z (F,): by the gradient, where that gets there."""
         found = None
-        if self.laplace.differentiable:
+        if self.approximate.differentiable:
             found = climb_by_slope(self.slope, z)
             if found is not None and found.distance < GOOD and found.is_top:
                 return found
@@ -210,7 +266,7 @@ class GaussianClimb:
             if arrived and self.method.restarts is None:
                 break
             centre = start if best is None else best.z
-            self.laplace.forget()
+            self.approximate.forget()
             there = finite_point(centre + rng.standard_normal(len(start)), self.objective, rng)
             found = self._climb(there)
             if found is not None and (best is None or found.value > best.value):
@@ -218,7 +274,7 @@ class GaussianClimb:
             k += 1
         if best is None:
             raise ArgumentError(
-                "Laplace's approximation is not finite (NaN or infinite) at every point tried",
+                f"{self.approximate.title} is not finite (NaN or infinite) at every point tried",
                 fix="give start={name: value} near plausible values",
             )
         return best, k
@@ -228,7 +284,7 @@ class GaussianClimb:
     ) -> Ascent:
         """The top of the approximation, called one."""
         report |= {
-            "likelihood": f"Laplace's approximation, not corrected: {why}",
+            "likelihood": f"{self.approximate.title}, not corrected: {why}",
             "approximate": True,
         }
         natural = None if information is None else self._natural(z, information)
@@ -250,14 +306,14 @@ class GaussianClimb:
 @dataclass(frozen=True)
 class _Corrected:
     """z (F,), information and Monte Carlo covariance (F, F) there; log-likelihood with its error,
-    and Laplace's; particles of the filters; whether the top rests."""
+    and the approximate one; particles of the filters; whether the top rests."""
 
     z: np.ndarray
     information: np.ndarray
     error: np.ndarray
     value: float
     value_error: float
-    laplace: float
+    approximate: float
     particles: int
     rests: bool
 
@@ -286,11 +342,11 @@ class _Correction:
                 if not np.all(np.isfinite(self.information)):
                     return "its second derivatives are not finite on the way"
                 self.axes = axes_of(self.information)
-            smooth, lacking, spread, bend = self._slopes(middle)
+            smooth, own, lacking, spread, bend = self._slopes(middle)
             slope = smooth + lacking
             if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(bend))):
                 return "the particle filter is not finite one standard deviation from its maximum"
-            curvature = np.maximum(1.0 - bend, LEAST_CURVATURE)
+            curvature = np.maximum(own - bend, LEAST_CURVATURE)
             step = slope / curvature
             step *= self._share(step, lacking, bend)
             self.z = self.z + self.axes @ step
@@ -302,7 +358,7 @@ class _Correction:
             far = bool(np.linalg.norm(step) > FAR)
         value, value_error = log_of_mean(middle)
         inverse = np.linalg.pinv(self.axes)
-        information = self.information - inverse.T @ np.diag(bend) @ inverse
+        information = self.information - inverse.T @ np.diag(bend + 1.0 - own) @ inverse
         scaled = self.axes / curvature
         error = scaled @ (spread + np.outer(step, step)) @ scaled.T
         return _Corrected(
@@ -314,6 +370,8 @@ class _Correction:
         """How much of a step is taken: no further than one standard deviation, and not downhill,
         with L itself and what it lacks as it was measured. 0 where all of it leads down."""
         share = min(1.0, REACH / max(float(np.linalg.norm(step)), REACH))
+        if self.climb.approximate.jumps:
+            return share
         here = self.climb.objective(self.z)
         for _ in range(HALVINGS):
             s = share * step
@@ -348,7 +406,7 @@ class _Correction:
             [random_state(self.root, k, i) for i in range(len(setup.problem.experiments))]
             for k in range(self.climb.method.averages)
         ]
-        near = [None if mode is None else mode.e for mode in self.climb.laplace.modes]
+        near = [None if mode is None else mode.e for mode in self.climb.approximate.modes]
         task = partial(twisted_log_z, setup.problem, self.particles, seeds, near)
         out = np.full((len(points), len(seeds)), -np.inf)
         there = [i for i, (_, log_prior) in enumerate(inside) if log_prior > -np.inf]
@@ -358,8 +416,9 @@ class _Correction:
         return out
 
     def _slopes(self, middle: np.ndarray) -> tuple[np.ndarray, ...]:
-        """In units of the axes, (N,): the slope of L with the prior; that of log Z - L, with its
-        covariance (N, N) over the seeds; and the second derivatives of log Z - L."""
+        """In units of the axes, (N,): the slope of L with the prior, and minus its second
+        derivatives; the slope of log Z - L, with its covariance (N, N) over the seeds; and its
+        second derivatives."""
         climb, k, n = self.climb, len(middle), self.axes.shape[1]
         weight = np.exp(middle - middle.max())
         weight /= weight.sum()
@@ -369,21 +428,29 @@ class _Correction:
         lacking = self._log_z(*points) - np.array([[climb.log_likelihood(z)] for z in points])
         up, down = lacking[:n], lacking[n:]
         slopes, bends = (up - down) / (2.0 * REACH), (up + down - 2.0 * here) / REACH**2
-        smooth = self._smooth_slope()
+        smooth, own = self._of_approximation()
         mean = slopes @ weight
         off = weight * (slopes - mean[:, None])
-        return smooth, mean, off @ off.T * k / (k - 1), bends @ weight
+        return smooth, own, mean, off @ off.T * k / (k - 1), bends @ weight
 
-    def _smooth_slope(self) -> np.ndarray:
-        """(N,) the slope of L with the prior, in units of the axes."""
-        climb = self.climb
-        if climb.laplace.differentiable:
+    def _of_approximation(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) the slope of L with the prior, in units of the axes, and minus its second
+        derivatives: those that made the axes; where L has jumps both over one standard deviation,
+        as those of log Z - L are, from which they then go out."""
+        climb, ones = self.climb, np.ones(self.axes.shape[1])
+        if climb.approximate.jumps:
+            wide = REACH * self.axes.T
+            here = climb.objective(self.z)
+            up, down = (np.array([climb.objective(self.z + sign * s) for s in wide])
+                        for sign in (1.0, -1.0))  # fmt: skip
+            return (up - down) / (2.0 * REACH), (2.0 * here - up - down) / REACH**2
+        if climb.approximate.differentiable:
             _, slope = climb.slope(self.z)
             if np.all(np.isfinite(slope)):
-                return slope @ self.axes
+                return slope @ self.axes, ones
         fine = FINE * self.axes.T
         values = [[climb.objective(self.z + sign * s) for sign in (1.0, -1.0)] for s in fine]
-        return np.array([(up - down) / (2.0 * FINE) for up, down in values])
+        return np.array([(up - down) / (2.0 * FINE) for up, down in values]), ones
 
 
 def axes_of(information: np.ndarray) -> np.ndarray:
