@@ -98,9 +98,13 @@ class CompleteScore:
         own = self._moved_by.get(parameter, [])
         return [parameter, *own, *(previous(s) for s in own)]
 
-    def obstacle(self, parameter: Expr) -> NotApplicable | None:
-        """Why the identities do not hold in this parameter; None where they do."""
-        trace, symbols = self.trace, self.involved(parameter)
+    def obstacle(self, parameter: Expr, there: Trace | None = None) -> NotApplicable | None:
+        """Why the identities do not hold in this parameter; None where they do.
+
+        there : the trace with the distributions that it has where the score is taken, of which some
+        terms may be gone; None: its own.
+        """
+        trace, symbols = there or self.trace, self.involved(parameter)
         sites = [(r, s) for r, group in (("initial", trace.initial),
                                          ("transition", trace.transition),
                                          ("observation", trace.observations))

@@ -121,6 +121,13 @@ def _begins_with_positive(a: Expr, op: str) -> bool:
     return _begins_with_number(a, op) and a.args[0].data > 0
 
 
+def _holds_above(a: Expr, d: Expr) -> bool:
+    """a = max(x, c) with a number c of at least the number d."""
+    if not (_number(d) and a.op == "maximum"):
+        return False
+    return any(_number(c) and d.data <= c.data for c in a.args)
+
+
 def without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
     """(b, e) with a = b exp(e), for products and quotients; no e where no factor is an exp."""
     done: dict[Expr, tuple[Expr, Expr | None]] = {}
@@ -214,6 +221,9 @@ RULES: dict[str, tuple[Rule, ...]] = {
         ("-(-x) = x", lambda a: a.op == "neg", lambda a: a.args[0]),
         ("-(c x) = (-c) x",
          lambda a: _begins_with_number(a, "mul"), lambda a: -a.args[0] * a.args[1]),
+    ),
+    "minimum": (
+        ("min(max(a, c), d) = d, d <= c", _holds_above, lambda a, d: d),
     ),
     "where": (
         ("where(c, a, b) = a if c else b",

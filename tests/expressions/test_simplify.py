@@ -11,7 +11,8 @@ from ssmppl.expressions.expr import RULES, Expr, apply, constant, symbol
 X, Y = symbol("state", "x"), symbol("state", "y")
 AT = {X: np.array([0.7, 1.3, 2.9]), Y: np.array([1.9, 0.4, 0.8])}
 NUMBERS = [constant(v) for v in (0.0, 1.0, -1.0, 0.5, 2.5)]
-SYMBOLIC = [X, Y, -X, 2.5 * X, 2.5 / Y, np.exp(X), X + Y]
+SYMBOLIC = [X, Y, -X, 2.5 * X, 2.5 / Y, np.exp(X), X + Y,
+            np.maximum(X, 1.0)]  # fmt: skip
 PRODUCTS = [Y * np.exp(X), np.exp(X) / Y, Y / np.exp(X), np.exp(-X) * X * np.exp(Y), 2 * np.exp(X)]
 CONDITIONS = [constant(1.0), constant(0.0), X < Y]
 

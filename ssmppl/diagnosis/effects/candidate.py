@@ -123,6 +123,11 @@ class Candidate:
         return OF_ROLE[self.role] if self.kind == "state" else self.kind
 
     @property
+    def reads_next(self) -> bool:
+        """Whether it is given the mean of the step, that with other effects in it."""
+        return "next" in self.effect.given.values()
+
+    @property
     def sided(self) -> int:
         """The sign that its strength must have, 0 for both."""
         return int(self.effect.lower >= 0.0) - int(self.effect.upper <= 0.0)

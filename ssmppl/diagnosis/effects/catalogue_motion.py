@@ -36,6 +36,13 @@ def coulomb_friction(v, strength, v0):
     return -strength * np.tanh(v / v0)
 
 
+@effect(on="rate", name="coulomb friction", form="sticking", lower=0, requires="both signs",
+        given={"new": "next"})  # fmt: skip
+def sticking_friction(v, new, strength):
+    """-clip(v', -l, l), v' the mean of the step without it: what is slower comes to rest"""
+    return -np.clip(new, -strength, strength)
+
+
 @effect(on="rate", name="stribeck", lower=0, requires="both signs",
         shapes={"v0": sds(0.05), "vs": sds(0.2, 0.6, between=(0.1, 2.0))})  # fmt: skip
 def stribeck(v, strength, v0, vs):

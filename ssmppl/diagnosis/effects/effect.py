@@ -45,6 +45,8 @@ a name or label     that one: "v", "x[0]"
 "integral"          likewise; not offered where none does
 "ahead"             "position"; in a simulator's step, where that ends without the effect
 "moved"             how far that one moves in the step
+"next"              the mean of the step, without the effect and with all others; not offered
+                    where a simulator's force acts on the state
 "other state"       another state: one candidate for each
 "any input"         an input: one candidate for each
 "second order"      what a second-order step would add to an Euler step: F'F / 2, F the increment
@@ -82,6 +84,7 @@ GIVEN = (
     "integral",
     "ahead",
     "moved",
+    "next",
     "other state",
     "any input",
     "second order",

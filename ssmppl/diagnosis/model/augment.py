@@ -4,7 +4,7 @@ Inputs and parameters are replaced first, in transitions and observations; means
 and starts are changed after that. Several effects on one equation add up. Auxiliary states join the
 model's own; those with the same distributions are shared. Each effect is bound to the model as it
 was, not to what others make of it: one after the other they are the same as all at once
-(`equations.py`).
+(`equations.py`). Only what is given the "next" mean comes behind the others and reads theirs.
 """
 
 from __future__ import annotations
@@ -88,7 +88,11 @@ def augment(
                 if c.strength not in known]  # fmt: skip
     # Before means are moved, which then are no more than what the simulator gives.
     new = linear(with_forces(new, inside), rest) if forced else new
-    new = _moved(new, [c for c in late if not c.force], equations, names, locations)
+    plain = [c for c in late if not c.force and not c.reads_next]
+    new = _moved(new, plain, equations, names, locations)
+    for c in late:  # what holds a state back does so against all others, and one after the other
+        if c.reads_next:
+            new = _moved(new, [c], Equations(new, equations), names, locations)
     parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:
         if prior:

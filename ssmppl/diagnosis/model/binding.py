@@ -236,6 +236,8 @@ def _given(
         return function(time_symbol(role), **{k: v for k, v in candidate.shape if k in wanted})
     if what == "second order":
         return _value(equations.second_order(part), effect)
+    if what == "next":
+        return _value(equations.reading(part), effect)
     if what == "moved":
         position = equations.position(part)
         if position is None:

@@ -237,6 +237,8 @@ def _reason(effect: Effect, part: Part, equations: Equations, scales: Scales) ->
         return "" if scale == "identity" else act
     if effect.requires:
         low, high = (scales.scale[part.label].quantile(level) for level in (0.02, 0.98))
+        if effect.requires == "both signs" and low == high:
+            return f"{part.label} does not vary"
         if effect.requires == "positive" and low <= 0.0:
             return "it takes values below 0"
         if effect.requires == "both signs" and (low > 0.0 or high < 0.0):
@@ -274,6 +276,10 @@ def _bindings(
     options: list[list[tuple[str, str]]] = []
     for argument, what in effect.given.items():
         if what in ("profile", "second order"):
+            continue
+        if what == "next":
+            if equations.force(part) is not None:
+                return [f"{part.label} is moved by a force of its simulator"]
             continue
         labels = _options(what, part, equations)
         if isinstance(labels, str):

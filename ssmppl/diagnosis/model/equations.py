@@ -14,12 +14,13 @@ f_j / d F) / (d f_i / d F) of x_j, f the transitions' means and F the term.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.changed_laws import Index, noise_free, on_its_scale, scale_of_mean
 from ssmppl.diagnosis.model.forces import Force, force_on
@@ -45,6 +46,8 @@ Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its incremen
 
 _POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
 _NEAR = 0.02  # that of what moves in small steps
+_SHORT = 1e-3  # a length of row at which almost everything moves in small steps
+_HALF = 0.1  # how far the share of the new value may then be from a half, for the higher orders
 _TERM = symbol("flow", "F")  # stands for a shared term
 
 
@@ -96,6 +99,7 @@ class Equations:
     """The parts of a traced model by label, and which state is the integral of which.
 
     integral_of : state -> the state that it integrates (a position's velocity).
+    share_of_new : such a state -> b of its step a v_prev + b mean(v), where b is not 0.
     copies : state -> the quantity that its transition only hands on.
     """
 
@@ -116,7 +120,10 @@ class Equations:
             for s in symbols("input", name, shape).ravel():
                 self._add("input", s)
         self.copies: dict[str, str] = base.copies if base else self._copies()
-        self.integral_of: dict[str, str] = base.integral_of if base else self._integrals()
+        self.integral_of: dict[str, str]
+        self.share_of_new: dict[str, Expr]
+        known = (base.integral_of, base.share_of_new) if base else self._integrals()
+        self.integral_of, self.share_of_new = known
 
     def _add(self, role: str, s: Expr) -> None:
         _, name, index = s.data
@@ -233,29 +240,67 @@ class Equations:
                     out[part.label] = label_of(*mean.data[1:])
         return out
 
-    def _integrals(self) -> dict[str, str]:
-        """x with mean - x_prev = a v_prev + b mean(v), a, b >= 0 the same whatever the parameters.
+    def _integrals(self) -> tuple[dict[str, str], dict[str, Expr]]:
+        """x with mean - x_prev = a v_prev + b mean(v), a, b >= 0 the same whatever the parameters;
+        and b.
 
         Which covers explicit, semi-implicit and trapezoidal steps; of what moves in small steps
-        within a row it is so up to their higher orders. The parameters are varied, so that -k x in
-        the equation of v does not make v an integral of x.
+        within a row it is so up to their higher orders, with a = b. The parameters are varied, so
+        that -k x in the equation of v does not make v an integral of x.
         """
         states = [p for p in self.of_role("state") if isinstance(self.step(p), Expr)]
         steps = {p.label: self.step(p) for p in states}
+        small = {k: _in_small_steps(step) for k, step in steps.items()}
         rng = np.random.default_rng(1)
-        ordinary = _ordinary(self.trace) if any(map(_in_small_steps, steps.values())) else {}
-        samples = [_values(self.trace, steps, rng, ordinary) for _ in range(3)]
+        ordinary: dict[Expr, float] = {}
+        scales: dict[Expr, float] = {}
+        if any(small.values()):  # which a row's length of any size is not
+            ordinary = _ordinary(self.trace)
+            scales = dict.fromkeys(_lengths_of_step(self.trace, steps), _SHORT)
+        samples = [_values(self.trace, steps, rng, ordinary, scales) for _ in range(3)]
         out: dict[str, str] = {}
+        shares: dict[str, Expr] = {}
         for p in states:
             if p.label in self.copies:
                 continue
             for v in states:
-                near = _NEAR if _in_small_steps(steps[p.label]) else _SMALL
-                if v is not p and all(_is_integral(p.label, v.label, s, near) for s in samples):
+                near = _NEAR if small[p.label] else _SMALL
+                found = [_integral(p.label, v.label, s, near) for s in samples]
+                weights = [w for w in found if w is not None]
+                if v is not p and len(weights) == len(found):
                     if out.get(v.label) != p.label:
                         out[p.label] = v.label
+                        share = _share_of_new(np.array(weights), small[p.label], samples)
+                        shares |= {p.label: share} if share is not None else {}
                     break
-        return out
+        return out, shares
+
+
+def _share_of_new(
+    weights: np.ndarray, small: bool, samples: Sequence[dict[Any, Any]]
+) -> Expr | None:
+    """b of a step a v_prev + b mean(v): a number, or one times an input; None where it is 0, or is
+    neither.
+
+    weights : (3, 2) a and b at three values of parameters and inputs. small : it moves in small
+    steps, which make a = b up to their higher orders.
+    """
+    whole = weights.sum(axis=1)
+    share = weights[:, 1] / whole
+    near = _NEAR if small else _SMALL
+    if small:
+        share = np.where(np.abs(share - 0.5) < _HALF, 0.5, share)
+    if np.ptp(share) > near or np.mean(share) <= near:
+        return None
+    lengths = {constant(1.0): np.ones(len(samples))}
+    for s in samples[0]:
+        if isinstance(s, Expr) and s.data[0] == "input_prev":
+            lengths[s] = np.array([float(sample[s]) for sample in samples])
+    for s, length in lengths.items():
+        ratio = whole / length
+        if np.ptp(ratio) <= near * np.mean(ratio):
+            return float(np.mean(share) * np.mean(ratio)) * s
+    return None
 
 
 def _ordinary(trace: Trace) -> dict[Expr, float]:
@@ -273,17 +318,22 @@ def _ordinary(trace: Trace) -> dict[Expr, float]:
 
 
 def _values(
-    trace: Trace, steps: dict[str, Any], rng: Any, ordinary: Mapping[Expr, float]
-) -> dict[str, tuple[Any, Any]]:
-    """Values and steps of the states at random points; inputs and time the same at all of them.
+    trace: Trace, steps: dict[str, Any], rng: Any, ordinary: Mapping[Expr, float],
+    scales: Mapping[Expr, float],
+) -> dict[Any, Any]:  # fmt: skip
+    """By label, values and steps of the states at random points; by symbol, the inputs and time,
+    the same at all of them.
 
-    ordinary : values of parameters, round which these are drawn.
+    ordinary : values of parameters, round which these are drawn. scales : of inputs that are not
+    of the size of 1.
     """
     roots = list(steps.values())
-    known = {}
+    known: dict[Any, Any] = {}
+    same: dict[Any, Any] = {}
     for s in symbols_of(roots):
         fixed = s.data[0] in ("input_prev", "time_prev")
-        known[s] = rng.uniform(0.3, 1.5, None if fixed else _POINTS)
+        known[s] = rng.uniform(0.3, 1.5, None if fixed else _POINTS) * scales.get(s, 1.0)
+        same |= {s: known[s]} if fixed else {}
         if s in ordinary:
             known[s] = ordinary[s] * rng.uniform(0.7, 1.4, _POINTS)
     for s in trace.state_prev_symbols:
@@ -291,7 +341,19 @@ def _values(
     moved = evaluate(roots, known)
     own = {label_of(*s.data[1:]): known[s] for s in trace.state_prev_symbols}
     wide = np.zeros(_POINTS)
-    return {k: (own[k], wide + m) for k, m in zip(steps, moved, strict=True)}
+    return {k: (own[k], wide + m) for k, m in zip(steps, moved, strict=True)} | same
+
+
+def _lengths_of_step(trace: Trace, steps: Mapping[str, Any]) -> list[Expr]:
+    """The inputs without which no state moves that has an equation: lengths of a row."""
+    rng, out = np.random.default_rng(2), []
+    for s in {s for step in steps.values() for s in symbols_of(step)}:
+        if s.data[0] == "input_prev":
+            values = _values(trace, dict(steps), rng, {}, {s: 0.0})
+            moved = [values[k][1] for k in steps]
+            if all(np.all(np.isfinite(m)) and np.all(np.abs(m) <= _SMALL) for m in moved):
+                out.append(s)
+    return out
 
 
 def _in_small_steps(step: Any) -> bool:
@@ -299,18 +361,19 @@ def _in_small_steps(step: Any) -> bool:
     return any(n.op in SEVERAL for n in topological([step]))
 
 
-def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]], near: float) -> bool:
+def _integral(x: str, v: str, values: dict[Any, Any], near: float) -> np.ndarray | None:
+    """(2,) a and b with which x moves by a v_prev + b mean(v); None where it does not."""
     moved = values[x][1]
     own, by = values[v]
     if not (np.all(np.isfinite(moved)) and np.all(np.isfinite(by))):
-        return False
+        return None
     if not np.any(np.abs(moved) > _SMALL):
-        return False
+        return None
     basis = np.stack([own, own + by], axis=1)
     coefficients, *_ = np.linalg.lstsq(basis, moved, rcond=1e-10)
     rest = moved - basis @ coefficients
     exact = np.max(np.abs(rest)) <= near * np.max(np.abs(moved))
-    return bool(exact and np.all(coefficients >= -_SMALL))
+    return coefficients if exact and np.all(coefficients >= -_SMALL) else None
 
 
 def time_symbol(role: str) -> Expr:
@@ -370,7 +433,8 @@ def shared_terms(equations: Equations) -> dict[str, list[Reaction]]:
 
 def carried(equations: Equations) -> dict[str, Reaction]:
     """Label of a state -> what integrates its new value, and so moves within the same step, as
-    in semi-implicit steps, x + h v_new."""
+    in semi-implicit steps, x + h v_new, and by half as much where a row is integrated: a constant
+    push that makes a velocity of g by the row's end has moved the position by h g / 2."""
     out: dict[str, Reaction] = {}
     for x, v in equations.integral_of.items():
         mean, whole = (equations.mean(equations.parts[label]) for label in (v, x))
@@ -383,6 +447,10 @@ def carried(equations: Equations) -> dict[str, Reaction]:
                 continue
             if not _moving(slope) and _TERM not in symbols_of(slope):
                 out[v] = ((x, slope),)
+        elif equations.parts[v].symbol in symbols_of(whole) or simulators(equations.trace):
+            continue  # what it reads is shifted, or a step that is not known
+        elif x in equations.share_of_new:
+            out[v] = ((x, equations.share_of_new[x]),)
     return out
 
 

@@ -69,8 +69,9 @@ def score_columns(
     free = [s for s in free if s in own or s.data[1] in strengths]
     free = [s for s in free if repr(s) not in refused]
     derived = CompleteScore(superset, free, missing, inert)
+    there = _without(superset, strengths)
     for s in free:
-        reason = derived.obstacle(s)
+        reason = derived.obstacle(s, there)
         if reason is None:
             wanted.append(s)
         else:
@@ -144,6 +145,24 @@ def _linear_in(
         superset,
         initial={n: linear(s) for n, s in superset.initial.items()},
         transition={n: linear(s) for n, s in superset.transition.items()},
+    )
+
+
+def _without(superset: Trace, strengths: Collection[str]) -> Trace:
+    """The trace with deterministic distributions of strengths 0: a slope in one, which may jump as
+    friction's does, is multiplied by it, and a derivative at 0 does not see how it changes."""
+    zero: dict[Expr, Expr] = {
+        s: constant(0.0) for s in superset.parameter_symbols if s.data[1] in strengths
+    }
+
+    def plain(site: Site) -> Site:
+        law = site.distribution
+        return replace(site, distribution=substituted(law, zero)) if type(law) is Dirac else site
+
+    return replace(
+        superset,
+        initial={n: plain(s) for n, s in superset.initial.items()},
+        transition={n: plain(s) for n, s in superset.transition.items()},
     )
 
 

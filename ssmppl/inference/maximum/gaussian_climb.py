@@ -117,9 +117,7 @@ class GaussianClimb:
     ArgumentError : the approximation is not finite at every point tried for a start.
     """
 
-    def __init__(
-        self, setup: Maximization, method: DirectOptimization, approximate: Approximate
-    ):
+    def __init__(self, setup: Maximization, method: DirectOptimization, approximate: Approximate):
         self.setup, self.method, self.approximate = setup, method, approximate
         self.arrived = False
         self.evaluations = 0

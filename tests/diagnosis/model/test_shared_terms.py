@@ -178,6 +178,123 @@ def test_an_explicit_step_carries_nothing():
     assert carried(Equations(traced("gap", "oscillator"))) == {}
 
 
+def swung(added, dt=None):
+    """A driven pendulum integrated over a row, `added` in its acceleration."""
+
+    def step(x, v, u, k, c, **rest):
+        def rhs(x, v):
+            return {"x": v, "v": u - k * np.sin(x) - c * v + added(v)}
+
+        new = ssm.integrate(rhs, {"x": x, "v": v}, rest.get("dt", DT), steps=4)
+        return {"x": ssm.Dirac(new["x"]), "v": ssm.Normal(new["v"], sd=0.1)}
+
+    def timed(x, v, u, dt, k, c):
+        return step(x, v, u, k, c, dt=dt)
+
+    def plain(x, v, u, k, c):
+        return step(x, v, u, k, c)
+
+    start = {n: ssm.Normal(0, sd=1) for n in ("x", "v")}
+    given = {n: ssm.HalfNormal(sd=1) for n in ("k", "c")}
+    inputs = ("u", "dt") if dt else ("u",)
+    return system(start, timed if dt else plain, lambda x: {"y": ssm.Normal(x, sd=1)}, *inputs,
+                  **given)  # fmt: skip
+
+
+@pytest.mark.parametrize("dt", [None, 0.02])
+def test_a_row_that_is_integrated_moves_the_position_by_half(dt):
+    """Against the equation with the same constant force in it, to the higher orders of a row."""
+    step = dt or DT
+    plain = swung(lambda v: 0.0, dt)
+    ((label, factor),) = carried(Equations(plain))["v"]
+    given = symbols_of(factor)
+    assert label == "x"
+    assert [s.data[1] for s in given] == (["dt"] if dt else [])
+    assert evaluate(factor, dict.fromkeys(given, step)) == pytest.approx(step / 2, rel=0.02)
+    rng = np.random.default_rng(4)
+    at = {n: rng.uniform(-1.0, 1.0, 20) for n in ("x", "v", "u", "k", "c")} | {"dt": step}
+    force = 0.7
+    before, after = (means(swung(lambda v, f=f: f, dt), at.__getitem__) for f in (0.0, force))
+    pushed = after["v"] - before["v"]
+    whole = after["x"] - before["x"]
+    np.testing.assert_allclose(step / 2 * pushed, whole, rtol=0.05)
+
+
+def test_a_position_that_reads_the_new_speed_is_moved_once():
+    model = ssm.Model("mass", inputs=("u",))
+    model.prior(lambda: {"k": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, v, u, k: {"v": ssm.Normal(v + DT * (u - k * x), sd=0.1)})
+    model.transition(lambda x, v_next: {"x": ssm.Normal(x + DT * v_next, sd=0.01)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    equations = Equations(trace(model))
+    assert equations.integral_of == {"x": "v"}
+    assert carried(equations) == {}
+
+
+# -- what holds a state back
+def held(extra=lambda v, u, strength: 0.0, stick=lambda new, strength: new):
+    """A mass with something in its new speed, and something that it then meets."""
+
+    def step(x, v, u, c, load, stop):
+        new = stick(v + DT * (u - c * v) + extra(v, u, load), stop)
+        return {"x": ssm.Dirac(x + DT * v), "v": ssm.Normal(new, sd=0.1)}
+
+    start = {n: ssm.Normal(0, sd=1) for n in ("x", "v")}
+    given = {n: ssm.HalfNormal(sd=1) for n in ("c", "load", "stop")}
+    return system(start, step, lambda x: {"y": ssm.Normal(x, sd=1)}, "u", **given)
+
+
+def test_friction_that_holds_takes_from_the_step_what_all_else_has_made_of_it():
+    """A load that is less than the friction does not move what rests, in either order."""
+    plain = held()
+    written = held(
+        lambda v, u, load: load, lambda new, l: np.sign(new) * np.maximum(np.abs(new) - l, 0)
+    )
+    found, _ = offers(plain, scales(plain), ["coulomb friction", "constant load"])
+    (stick,) = [c for c in found if c.effect.form == "sticking"]
+    (load,) = [c for c in found if c.effect.name == "constant load"]
+    assert stick.equation == load.equation == "v"
+    numbers = {"load": 0.11, load.strength: 0.11, "stop": 0.3, stick.strength: 0.3}
+    draw = {}
+
+    def at(name):
+        rng = np.random.default_rng(len(draw))
+        return numbers.get(name) or draw.setdefault(name, rng.uniform(-0.6, 0.6, 20))
+
+    whole = means(written, at)
+    assert np.any(whole["v"] == 0.0)
+    assert np.any(whole["v"] != 0.0)
+    one = augment(plain, [stick])
+    for added in (augment(plain, [stick, load]), augment(plain, [load, stick]),
+                  augment(one, [load])):  # fmt: skip
+        moved = means(added, at)
+        for state in ("x", "v"):
+            np.testing.assert_allclose(moved[state], whole[state], rtol=1e-12, atol=1e-14)
+
+
+def test_two_that_hold_hold_together():
+    @ssm.effect(on="v", name="brake", lower=0, given={"new": "next"})
+    def brake(v, new, strength):
+        return -np.clip(new, -strength, strength)
+
+    plain = held()
+    found, _ = offers(plain, scales(plain), ["coulomb friction", brake])
+    both = [c for c in found if c.reads_next]
+    assert len(both) == 2
+    known = {both[0].strength: 0.1, both[1].strength: 0.2}
+    draw = {}
+
+    def at(name):
+        rng = np.random.default_rng(len(draw))
+        return known.get(name) or draw.setdefault(name, rng.uniform(-0.6, 0.6, 20))
+
+    before = means(plain, at)["v"]
+    after = means(augment(plain, both), at)["v"]
+    np.testing.assert_allclose(after, np.sign(before) * np.maximum(np.abs(before) - 0.3, 0.0),
+                               atol=1e-14)  # fmt: skip
+
+
 def test_the_pole_on_a_cart_in_semi_implicit_steps():
     """The new speed is held by the position too: that is no flow, and hides none."""
 
