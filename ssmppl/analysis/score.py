@@ -26,6 +26,7 @@ from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import differentiate, jumps
 from ssmppl.expressions.expr import Expr, constant, dependent, symbol, symbols_of, topological
+from ssmppl.expressions.loops.affine import scaling_of_exponentials
 from ssmppl.language.model.trace import Site, Trace, previous
 
 ROLES = ("initial", "transition", "observation")
@@ -124,8 +125,9 @@ class CompleteScore:
             changing = dependent(roots, symbols)
             if not any(map(jumps, changing)):
                 continue
+            smooth = scaling_of_exponentials(roots)
             for node in topological(roots):  # the first of them
-                if jumps(node) and node in changing:
+                if jumps(node) and node in changing and node not in smooth:
                     text = shorten(repr(node), TEXT, placeholder=" ...")
                     return NotApplicable(
                         f"the distribution of {site.name} changes by steps in {parameter!r}, by "

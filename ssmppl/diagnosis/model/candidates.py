@@ -21,6 +21,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import jumps
 from ssmppl.expressions.expr import symbols_of, topological
+from ssmppl.expressions.loops.affine import scaling_of_exponentials
 from ssmppl.language.checks.rules import RESERVED
 from ssmppl.language.model.trace import Trace
 
@@ -248,7 +249,9 @@ def _reason(effect: Effect, part: Part, equations: Equations, scales: Scales) ->
         if isinstance(term, NotApplicable):
             return term.reason
         # Beside it no score could be taken, in no parameter that is in it.
-        return "the derivative of its transition jumps" * any(map(jumps, topological([term])))
+        smooth = scaling_of_exponentials([term])
+        jumping = any(jumps(n) and n not in smooth for n in topological([term]))
+        return "the derivative of its transition jumps" * jumping
     return ""
 
 

@@ -17,7 +17,12 @@ import numpy as np
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.effects.effect import CHANGE_IN_TIME, NOISE_LAW, UNKNOWN_INPUT
+from ssmppl.diagnosis.effects.effect import (
+    CHANGE_IN_TIME,
+    MECHANISM,
+    NOISE_LAW,
+    UNKNOWN_INPUT,
+)
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import FROM_START, Fit
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
@@ -58,7 +63,8 @@ MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second 
 CARRIES_ON = 0.1  # of what a further cause gains one row ahead, that it has to gain beyond
 PROMISING = 0.25  # of the best refit's score, by moving an input alone: then its delay is refitted
 MOST_LOST = 1.0  # nats, further ahead, by what only describes a misfit
-FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
+# Refits after a second screen, of all and of mechanisms, and the simulated sets of that.
+FOLLOWERS, AGAIN = 3, 100
 AGAIN_CALLED = 60  # likewise, of a model that calls a simulator
 PROMISED = 0.25  # of what a further effect has to gain, by its score: else it is not refitted
 FIRST_LOOK, NOTHING = 30, 0.5  # of these sets first; a family-wise p of so much by them is no gap
@@ -370,7 +376,7 @@ class EffectSelection:
             if float(np.min(again.family.p, initial=1.0)) > CLOSER_LOOK_FACTOR * self.alpha:
                 return
             least = PROMISED * FORM * chosen.score
-            found = [k for k in leading(again)[:FOLLOWERS] if again.efficient.gain[k] >= least]
+            found = [k for k in _followers(again) if again.efficient.gain[k] >= least]
             if not found:
                 return
             more, failed = self._refit(
@@ -440,6 +446,14 @@ def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | No
         found = int(screen.groups[k]) not in done and screen.efficient.gain[k] > best
         return k if found and float(screen.candidate_p[k]) <= alpha else None
     return None
+
+
+def _followers(again: Screen) -> list[int]:
+    """What a second screen has refitted: the leading ones, and as many mechanisms. Where a first
+    effect has but about the right formula, laws of the noise lead that fit what it leaves."""
+    order = leading(again)
+    causes = [k for k in order if again.design.candidates[k].effect.cause == MECHANISM]
+    return list(dict.fromkeys([*order[:FOLLOWERS], *causes[:FOLLOWERS]]))
 
 
 def _simulates(r: Refit, new: Sequence[Candidate], worth: float) -> bool:

@@ -7,7 +7,7 @@ linear Gaussian, and linear in what its inputs and parameters add.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from ssmppl.expressions.loops.loop import fresh, repeated
 Matrix = np.ndarray  # of nodes
 TERMS = 16  # of the series of an exponential
 MOST_HALVINGS = 60.0
+NAME = "expm"  # of its loops
 
 
 def affine_form(
@@ -141,8 +142,15 @@ def exponential(matrix: Matrix) -> Matrix:
     total = _series(scaled)
     symbols = fresh(n * n)
     x = array_of(symbols, (n, n))
-    values = repeated("expm", symbols, list(total.ravel()), list(dot(x, x).ravel()), halvings)
+    values = repeated(NAME, symbols, list(total.ravel()), list(dot(x, x).ravel()), halvings)
     return array_of(values, (n, n))
+
+
+def scaling_of_exponentials(roots: Iterable[Expr]) -> set[Expr]:
+    """The loops of exponentials of matrices, and what says how often they are halved and squared.
+    It jumps, and they do not: any number gives the same matrix, to rounding."""
+    loops = [n for n in topological(roots) if n.op == "loop" and n.data.name == NAME]
+    return {*loops, *topological([n.args[-1] for n in loops])}
 
 
 def _series(scaled: Matrix) -> Matrix:
@@ -153,5 +161,5 @@ def _series(scaled: Matrix) -> Matrix:
     product = dot(scaled, x)
     update = [e / k + (1.0 if i % (n + 1) == 0 else 0.0) for i, e in enumerate(product.ravel())]
     first = [*_nodes(np.eye(n)).ravel(), constant(float(TERMS))]
-    values = repeated("expm", symbols, first, [*update, k - 1.0], constant(float(TERMS)))
+    values = repeated(NAME, symbols, first, [*update, k - 1.0], constant(float(TERMS)))
     return array_of(values[:-1], (n, n))

@@ -25,6 +25,7 @@ from ssmppl.diagnosis.model.changed_laws import (
     values_on_its_scale,
 )
 from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.diagnosis.report.model_file import to_model
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import differentiate
@@ -348,6 +349,31 @@ def test_strengths_have_scores_in_closed_form():
         score = CompleteScore(augment(t, found), strengths(found), Missing(none=True))
         for s in strengths(found):
             assert score.obstacle(s) is None, (s, score.obstacle(s))
+
+
+def test_parameters_of_an_exponential_have_scores():
+    """A linear equation is solved over a row by an exponential, whose halvings jump and whose
+    values do not: nothing of it is refused."""
+
+    def step(x, v, u, inertia, c):
+        def rhs(x, v):
+            return {"x": v, "v": (u - c * v) / inertia}
+
+        new = ssm.integrate(rhs, {"x": x, "v": v}, 0.01)
+        return {"x": ssm.Dirac(new["x"]), "v": ssm.Normal(new["v"], sd=0.1)}
+
+    model = ssm.Model("motor", inputs=("u",))
+    model.prior(lambda: {"inertia": ssm.HalfNormal(sd=1), "c": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=1)})
+    model.transition(step)
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    t = trace(model)
+    found = [c for c in offers(t, scales(t))[0] if c.first_order]
+    columns = score_columns(t, augment(t, found), {c.strength for c in found}, (),
+                            Missing(none=True))  # fmt: skip
+    assert columns.refused == {}
+    assert {s.data[1] for s in columns.nuisance} == {"inertia", "c"}
+    assert any(n.startswith("parameter_drift_inertia") for n in columns.names)
 
 
 # -- several together, names, priors

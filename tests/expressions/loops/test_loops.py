@@ -11,7 +11,13 @@ from ssmppl.analysis.bounds import interval
 from ssmppl.analysis.lambdify import python_function
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import separate
-from ssmppl.expressions.calculus import differentiate, gradient, hessian, reverse_gradient
+from ssmppl.expressions.calculus import (
+    differentiate,
+    gradient,
+    hessian,
+    jumps,
+    reverse_gradient,
+)
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     Expr,
@@ -22,7 +28,7 @@ from ssmppl.expressions.expr import (
     symbols_of,
     topological,
 )
-from ssmppl.expressions.loops.affine import affine_form
+from ssmppl.expressions.loops.affine import affine_form, exponential, scaling_of_exponentials
 from ssmppl.expressions.loops.loop import fresh, repeated
 from ssmppl.expressions.zero import cancels
 
@@ -255,3 +261,16 @@ def test_a_loop_of_the_block_alone_is_one_of_its_functions():
     assert evaluate(found.assemble(), AT) == pytest.approx(evaluate(A * end + B, AT), rel=1e-15)
     mixed = ssm.integrate(lambda x: -A * x**3, X, 0.5, steps=3)
     assert isinstance(separate(mixed, [X]), NotApplicable)
+
+
+def test_what_scales_an_exponential_is_told_from_other_steps():
+    """Halvings jump in the matrix; the exponential does not, and a floor beside it does."""
+    a = symbol("parameter", "a")
+    matrix = np.array([[-a, 1.0], [a, -2.0]], dtype=object)
+    ends = list(exponential(matrix).ravel())
+    smooth = scaling_of_exponentials(ends)
+    jumping = [n for n in topological(ends) if jumps(n)]
+    assert jumping
+    assert set(jumping) <= smooth
+    other = np.floor(3.0 * a)
+    assert other not in scaling_of_exponentials([ends[0] + other])
