@@ -25,7 +25,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "where": ("equation", "moment", "t_from", "t_to", "region", "z", "p", "experiment"),
     "causes": (
         "effect", "form", "equation", "kind", "z", "p", "gain_screen", "gain_refit", "class_id",
-        "sign", "estimate", "se",
+        "sign", "estimate", "se", "rate",
     ),
     "classes": ("class_id", "effect", "equation", "rho", "separating_input"),
     "probabilities": (

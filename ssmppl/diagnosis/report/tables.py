@@ -10,7 +10,13 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.data.channels import column_names
 from ssmppl.data.time_steps import lengths
-from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, starts_of
+from ssmppl.diagnosis.effects.candidate import (
+    Candidate,
+    is_dated,
+    is_pulse,
+    shape_text,
+    starts_of,
+)
 from ssmppl.diagnosis.experiment.design import Separation
 from ssmppl.diagnosis.experiment.recovery import Recovery
 from ssmppl.diagnosis.heldout.predictions import FreeRun
@@ -29,6 +35,7 @@ if TYPE_CHECKING:
 
 CURVE_POINTS, WAVE_POINTS = 41, 161  # of curves, and of those that go up and down
 FIRST = 1  # number of the class of the best
+EVEN = 1e-6  # relative, by which the lengths of rows may differ that count as the same
 AT_BOUND = 1e-3  # standard errors of the screen, below which a one-sided strength is none
 STANDS_OUT = 3.0  # |z| of a region that is named
 # Of the error rate, for the places and for the checks of the predictions: with the whole of it for
@@ -226,7 +233,24 @@ def _strength_row(screen: Screen, c: Candidate, strength: float, error: float) -
         "form": ", ".join(filter(None, [c.form, shape])),
         "sign": "one-sided" if c.sided else ("+" if strength > 0 else "-"),
         "estimate": float(strength), "se": float(error),
+        "rate": float(strength / length_of_row(screen)) if _is_increment(c) else np.nan,
     }  # fmt: skip
+
+
+def length_of_row(screen: Screen) -> float:
+    """The model's time step, where it declares one and all rows have the same; else NaN."""
+    step = screen.design.trace.time_step
+    if step is None:
+        return np.nan
+    found = np.concatenate([e.inputs[step[0]][: max(e.steps - 1, 1)] for e in screen.experiments])
+    even = found.min() > 0.0 and np.ptp(found) <= EVEN * found.min()
+    return float(np.median(found)) if even else np.nan
+
+
+def _is_increment(c: Candidate) -> bool:
+    """Whether its strength is what it adds to a state in each step, which is a rate over time."""
+    each = c.change == "transition" and not c.process and not is_pulse(c) and not c.force
+    return each and "second order" not in c.effect.given.values()
 
 
 def _when(c: Candidate, shape: str, value: float, times: Sequence[Any]) -> str:

@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from ssmppl.diagnosis.effects.effect import MECHANISM, NOISE_LAW, UNKNOWN_INPUT
 from ssmppl.diagnosis.experiment.design import ALIKE, OUTSIDE, SURE, Separation
 from ssmppl.diagnosis.heldout.simulation import WINDOWED
 from ssmppl.diagnosis.model.basis import WHERE
@@ -246,6 +247,8 @@ def headline(report: Findings) -> str:
         if unfitted:
             return sentence(f"{text} The model with {row_label(found[0])} could not be fitted (see "
                             "the notes), so that its held-out gain is not known")  # fmt: skip
+        if mechanism := promising_mechanism(report):
+            text += f" That stands for any cause; {mechanism}."
         return sentence(f"{text} The held-out gain has not been measured yet")
     lacks, adding = _lacks(groups)
     text, measured = f"{named(report)} lacks {lacks}", share(report)
@@ -260,6 +263,27 @@ def headline(report: Findings) -> str:
     return sentence(
         f"{text} ({sure}), but {kept_back(report)} the gain is too uncertain for a share of the "
         "reference model's gain"
+    )
+
+
+def promising_mechanism(report: Findings) -> str:
+    """Where a description leads by its score, which is of any misfit: the mechanism that promises
+    most, as a clause; "" where a mechanism leads, or none is significant."""
+    if report.mode != "fast" or not (found := leaders(report)):
+        return ""
+    alpha = report.settings.get("alpha", 0.05)
+    sure = [
+        r for r in rows(report.causes)
+        if r.get("kind") == MECHANISM and is_number(r["p"]) and r["p"] <= alpha
+        and is_number(r.get("gain_screen"))
+    ]  # fmt: skip
+    if found[0].get("kind") not in (UNKNOWN_INPUT, NOISE_LAW) or not sure:
+        return ""
+    best = max(sure, key=lambda r: r["gain_screen"])
+    return (
+        f"of the mechanisms tried, {row_label(best)} promises most "
+        f"({number(best['gain_screen'], 2)} nats), and only refits, in full mode, decide between "
+        "them"
     )
 
 
@@ -361,7 +385,7 @@ def which(report: Findings) -> list[str]:
         form = f", {row['form']}" if isinstance(row.get("form"), str) and row["form"] else ""
         text = f"{row_label(row)}{form}"
         if is_number(row.get("estimate")):
-            text += f": strength {with_error(row['estimate'], row.get('se'))}"
+            text += f": strength {with_error(row['estimate'], row.get('se'))}{_by_time(row)}"
         gains = [row.get("gain_refit"), row.get("gain_screen")]
         gain = next((g for g in gains if is_number(g)), None)
         if gain is not None:
@@ -378,9 +402,20 @@ def which(report: Findings) -> list[str]:
             names = listed([row_label(r) for r in others], "or")
             text = f"not distinguishable by these data from {names}{_closeness(report, others)}"
             out.append(sentence(text))
+        elif row is found[0] and (mechanism := promising_mechanism(report)):
+            out.append(sentence(f"it stands for any cause: {mechanism}"))
         elif row.get("class_id") in [r["class_id"] for r in rows(report.classes)]:
             out.append("These data distinguish it from every other effect tried.")
     return out
+
+
+def _by_time(row: dict[str, Any]) -> str:
+    """What the strength is per unit of time, where it is added in each step of a known length."""
+    rate: Any = row.get("rate")
+    if not is_number(rate) or not row["estimate"]:
+        return ""
+    error = row["se"] * rate / row["estimate"] if is_number(row.get("se")) else math.nan
+    return f" per row, {with_error(rate, error)} per unit of time"
 
 
 def _closeness(report: Findings, others: Sequence[dict[str, Any]]) -> str:

@@ -147,10 +147,11 @@ def test_a_chosen_effect_of_another_shape_has_its_numbers():
     refit = SimpleNamespace(
         candidates=(other,), strengths=[0.25], errors={"coulomb_friction_v_2": 0.01}, bounds=[]
     )
-    design = SimpleNamespace(candidates=[head])
+    design = SimpleNamespace(candidates=[head], trace=SimpleNamespace(time_step=None))
     screen = SimpleNamespace(design=design, experiments=[SimpleNamespace(time=None)])
     results = SimpleNamespace(chosen=refit, screen=screen, unfitted=None)
     (found,) = build._leading(results, [0])
+    assert np.isnan(found.pop("rate"))
     assert found == {"row": 0, "form": "v0 = 0.123", "sign": "one-sided", "estimate": 0.25,
                      "se": 0.01}  # fmt: skip
 

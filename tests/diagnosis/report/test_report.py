@@ -118,7 +118,9 @@ def test_leaders_are_the_chosen_causes_each_on_its_equation():
         ("coulomb friction", "speed[1]"),
     ]
     same_name = dataclasses.replace(report, chosen=["coulomb friction"] * 2)
-    assert leaders(same_name) == leaders(report)
+    assert [(r["effect"], r["equation"]) for r in leaders(same_name)] == [
+        (r["effect"], r["equation"]) for r in leaders(report)
+    ]
     # one that is not among the causes is named all the same
     other = dataclasses.replace(report, chosen=["my effect"])
     assert "my effect" in headline(other)
@@ -224,6 +226,22 @@ def test_where_names_the_places_that_stand_out_and_no_others():
     assert where(no_gap()) == [
         "No equation shows misfit that is significant after correction for multiple testing."
     ]
+
+
+def test_what_stands_for_any_cause_does_not_lead_alone_in_fast_mode():
+    """A latent process takes any misfit of a mean: its score says nothing against mechanisms."""
+    found = fast()
+    table = found.causes.copy()
+    table.loc[0, ["effect", "form", "kind"]] = ["missing input", "ar1", "unknown input"]
+    classes = found.classes.replace({"effect": {"quadratic drag": "missing input"}})
+    classes = classes[classes["class_id"] > 1]
+    told = dataclasses.replace(found, causes=table, classes=classes)
+    for text in (headline(told), " ".join(which(told))):
+        assert "state-dependent damping in v promises most (17 nats)" in text
+        assert "every other effect" not in text
+    weak = table.assign(p=[0.001] + [0.9] * (len(table) - 1))
+    for quiet in (found, dataclasses.replace(told, causes=weak)):
+        assert "promises" not in headline(quiet) + " ".join(which(quiet))
 
 
 def test_how_far_says_what_moved_and_which_way():

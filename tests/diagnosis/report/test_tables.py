@@ -1,5 +1,6 @@
 """Rows of the report's tables that need care."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +21,7 @@ from ssmppl.diagnosis.experiment.design import ALIKE, BEHIND, OUTSIDE
 from ssmppl.diagnosis.experiment.recovery import Recovery
 from ssmppl.diagnosis.report.tables import (
     _experiments,
+    _strength_row,
     _when,
     bonferroni,
     causes_table,
@@ -30,6 +32,7 @@ from ssmppl.diagnosis.report.tables import (
     signals_table,
     where_table,
 )
+from ssmppl.diagnosis.report.words import _by_time
 from ssmppl.diagnosis.screening.location import localise
 from ssmppl.diagnosis.selection.equivalence import Classes
 from ssmppl.drawing.numerals import label, span
@@ -47,7 +50,8 @@ BREAK = Candidate(level_break, "v", (("date", 2.0),), strength="break")
 def table(candidate, strength, variance, refits=(), *, sided=False, quadratic=False):
     screen = SimpleNamespace(
         design=SimpleNamespace(
-            candidates=[candidate], sided=np.array([int(sided)]), quadratic=np.array([quadratic])
+            candidates=[candidate], sided=np.array([int(sided)]), quadratic=np.array([quadratic]),
+            trace=SimpleNamespace(time_step=None),
         ),
         efficient=SimpleNamespace(
             strength=np.array([strength]), variance=np.array([variance]), z=np.array([2.0]),
@@ -64,6 +68,29 @@ def refitted(candidate, strength, error):
         index=(0,), candidates=(candidate,), strengths=[strength], gain=0.0,
         errors={candidate.strength: error}, bounds=[],
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "rate"),
+    [("dt", [0.02, 0.02, 0.02], 15.0), ("dt", [0.02, 0.03, 0.02], np.nan), ("", [], np.nan)],
+)
+def test_an_increment_of_each_step_is_told_by_time(name, steps, rate):
+    """Where the model declares its time step, and all are alike."""
+    one = SimpleNamespace(steps=len(steps), inputs={name: np.array(steps)}, time=None)
+    declared = (name, "s") if name else None
+    found = _strength_row(
+        SimpleNamespace(design=SimpleNamespace(trace=SimpleNamespace(time_step=declared)),
+                        experiments=[one]), DRAG, 0.3, 0.1,
+    )  # fmt: skip
+    assert found["rate"] == pytest.approx(rate, nan_ok=True)
+    told = _by_time({**found, "estimate": 0.3, "se": 0.1})
+    assert told == ("" if np.isnan(rate) else " per row, 15.0 ± 5.0 per unit of time")
+
+
+def test_what_is_no_increment_has_no_rate():
+    screen = SimpleNamespace(design=None, experiments=[])
+    for c in (LOAD, replace(DRAG, force="torque")):
+        assert np.isnan(_strength_row(screen, c, 0.3, 0.1)["rate"])
 
 
 def test_a_refit_at_its_bound_is_none():
