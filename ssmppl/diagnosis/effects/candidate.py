@@ -53,7 +53,8 @@ class Candidate:
     role : what the equation is: "state", "channel", "input" or "parameter".
     held : its process is held at 1: see `increment`.
     reaction : (label, factor) of each equation that moves with its own, by so many times as much
-        (`shared_terms`). carried : likewise of what integrates its new value.
+        (`shared_terms`). carried : likewise of what integrates its new value. halfway : likewise of
+        what integrates it over the row, where that is not part of its step's own text.
     alike : labels of further inputs in which the same happens, with the same strength.
     force : the argument of a simulator through which it acts, in whose unit its strength is; "" for
         an increment of the equation itself.
@@ -70,6 +71,7 @@ class Candidate:
     shares: str = ""
     reaction: tuple[tuple[str, Expr], ...] = ()
     carried: tuple[tuple[str, Expr], ...] = ()
+    halfway: tuple[tuple[str, Expr], ...] = ()
     force: str = ""
     alike: tuple[str, ...] = ()
 

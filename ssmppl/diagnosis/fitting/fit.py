@@ -27,6 +27,7 @@ from ssmppl.diagnosis.fitting.densities import (
     density_of,
     one_by_one,
 )
+from ssmppl.diagnosis.fitting.information import not_inflated, positive_definite
 from ssmppl.diagnosis.fitting.noisy_ascent import NEAR, stochastic_quasi_newton
 from ssmppl.diagnosis.fitting.scoring import climb_by_scoring
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
@@ -67,7 +68,6 @@ from ssmppl.language.model.transforms import transforms
 NOISE_SHARES = (1.0, 0.3, 0.1)  # of the transition's noise, from which climbs start
 ASTRAY = 3.0  # nats that the climb of the approximation may cost by the particle filter
 SCORED = 0.05  # nats that a climb by scoring may leave
-SPREAD = 0.1  # least information of a logarithm that steps are made with
 
 # Likelihoods and information by simulation.
 PILOT_PARTICLES = 300
@@ -701,6 +701,8 @@ class Fitter:
             found = self._simulated_information(fit.space, fit.theta, seed)
         except SamplingError:  # then there are no standard errors
             found = np.full_like(fit.information, np.nan)
+        if (smooth := self._extended_log_likelihood(fit.problem)) is not None:
+            found = not_inflated(found, self._curvature_of(smooth, fit), free)
         return replace(fit, information=found)
 
     def _curvature(self, fit: Fit, many: Increments) -> np.ndarray:
@@ -714,23 +716,27 @@ class Fitter:
 
         return information_of_many(inside, fit.z[free], fit.information[np.ix_(free, free)])
 
+    def _curvature_of(self, smooth: Callable[[np.ndarray], float], fit: Fit) -> np.ndarray:
+        """(F, F) minus the second derivatives of the log posterior by the extended filter, NaN in
+        what is at a bound."""
+        function, free = density_of(fit.space, smooth), ~fit.at_bound
+
+        def inside(free_z: np.ndarray) -> float:
+            z = fit.z.copy()
+            z[free] = free_z
+            return function(z)
+
+        found = np.full((len(free), len(free)), np.nan)
+        found[np.ix_(free, free)] = information_at(inside, fit.z[free])
+        return found
+
     def _second_derivatives(
         self, kalman: KalmanModel, fit: Fit, seed: np.random.SeedSequence
     ) -> Iterator[np.ndarray]:
         """(F, F) minus those of the log posterior at the fit, NaN in what is at a bound: the
         cheapest first."""
-        smooth, free = self._extended_log_likelihood(fit.problem), ~fit.at_bound
-        if smooth is not None:
-            function = density_of(fit.space, smooth)
-
-            def inside(free_z: np.ndarray) -> float:
-                z = fit.z.copy()
-                z[free] = free_z
-                return function(z)
-
-            found = np.full((len(free), len(free)), np.nan)
-            found[np.ix_(free, free)] = information_at(inside, fit.z[free])
-            yield found
+        if (smooth := self._extended_log_likelihood(fit.problem)) is not None:
+            yield self._curvature_of(smooth, fit)
         setup = Maximization(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
         yield observed_information(setup, fit.z)
 
@@ -784,15 +790,3 @@ def component_names(space: Space, mask: np.ndarray) -> list[str]:
         every += (repr(t.components[k]) if single else t.site.name for k in range(len(t.free)))
     free = [every[i] for i in space.positions]
     return list(dict.fromkeys(n for n, m in zip(free, mask, strict=True) if m))
-
-
-def positive_definite(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:
-    """The projection of `information` (F, F) on positive definite matrices, for steps of a climb.
-
-    logarithms : (F,) are known to have moderate units, and steps of them are kept moderate.
-    """
-    scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), np.where(logarithms, SPREAD, 0.0)))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    projected = (vectors * np.maximum(np.abs(values), 0.05)) @ vectors.T
-    return projected * np.outer(scale, scale)

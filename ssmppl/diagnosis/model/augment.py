@@ -53,14 +53,17 @@ def augment(
     candidates : their strengths become scalar parameters, in this order behind the model's own.
     prior : whether they get a prior: Flat, HalfFlat where the strength is at least 0, Uniform
         between two bounds. False leaves them as symbols that no site declares, for derivatives.
-    first_order : what acts by a simulator's force only has to have the right score at strength 0
-        (`forces.linear`).
+    first_order : for scores at strength 0. What acts by a simulator's force only has to have the
+        right one there (`forces.linear`); what moves `halfway` stays: where it has no noise, and is
+        measured next to exactly, a complete-data score through it is nothing but Monte Carlo error.
 
     Raises
     ------
     ArgumentError : two candidates have a strength of the same name, or one does not fit the model.
     ModelError : an effect's function does not do what its kind says.
     """
+    if first_order:
+        candidates = [replace(c, halfway=()) for c in candidates]
     origin = as_it_was(trace)
     equations = Equations(origin)
     _check(candidates, trace, equations)
@@ -151,7 +154,7 @@ def _check(candidates: Sequence[Candidate], trace: Trace, equations: Equations) 
                 fix="give each candidate a name of its own: replace(candidate, strength=...)",
             )
         taken[c.strength] = f"the strength of {c}"
-        moved = [label for label, _ in (*c.reaction, *c.carried)]
+        moved = [label for label, _ in (*c.reaction, *c.carried, *c.halfway)]
         for label in (c.equation, *c.alike, *dict(c.bound).values(), *moved):
             if label not in equations.parts:
                 raise ArgumentError(

@@ -69,7 +69,7 @@ def bind(
             out.transition, out.initial = _laws(effect, returned, names, role)
         returned = returned.change
     out.changes = _changes(candidate, returned, part)
-    also = () if own else (*candidate.reaction, *candidate.carried)
+    also = () if own else (*candidate.reaction, *candidate.carried, *candidate.halfway)
     if also and len(out.changes) == 1:
         (increment,) = out.changes.values()
         out.changes |= {label: increment * factor for label, factor in also}

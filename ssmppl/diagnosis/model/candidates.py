@@ -155,6 +155,8 @@ def _of_effect(
                 made, moves = [replace(c, force=force.name) for c in made], False
             if moves and part.label in shared.carried:
                 made = [replace(c, carried=shared.carried[part.label]) for c in made]
+            if moves and part.label in shared.halfway:
+                made = [replace(c, halfway=shared.halfway[part.label]) for c in made]
             reason = _check(made[0], equations)
             if reason:
                 refuse(part.label, reason)
@@ -355,7 +357,7 @@ def _check(candidate: Candidate, equations: Equations) -> str:
         if not reason and part.role == "state" and change == "transition":
             scale = scale_of_mean(equations.law(part))
             reason = scale.reason if isinstance(scale, NotApplicable) else ""
-        if reason and label not in dict(candidate.carried):
+        if reason and label not in dict((*candidate.carried, *candidate.halfway)):
             return f"it changes {label} too: {reason}"
     return ""
 

@@ -394,15 +394,16 @@ def components(trace: Trace, role: str, name: str, shape: tuple[int, ...]) -> An
 
 @dataclass(frozen=True)
 class SharedTerms:
-    """What moves with each state: by terms that are shared, and what is `carried`."""
+    """What moves with each state: by terms that are shared, what is `carried`, and `halfway`."""
 
     reactions: Mapping[str, list[Reaction]]
     carried: Mapping[str, Reaction]
+    halfway: Mapping[str, Reaction]
 
     @classmethod
     def of(cls, equations: Equations) -> SharedTerms:
         """The shared terms of a model."""
-        return cls(shared_terms(equations), carried(equations))
+        return cls(shared_terms(equations), carried(equations), halfway(equations))
 
 
 def shared_terms(equations: Equations) -> dict[str, list[Reaction]]:
@@ -433,8 +434,7 @@ def shared_terms(equations: Equations) -> dict[str, list[Reaction]]:
 
 def carried(equations: Equations) -> dict[str, Reaction]:
     """Label of a state -> what integrates its new value, and so moves within the same step, as
-    in semi-implicit steps, x + h v_new, and by half as much where a row is integrated: a constant
-    push that makes a velocity of g by the row's end has moved the position by h g / 2."""
+    in semi-implicit steps, x + h v_new."""
     out: dict[str, Reaction] = {}
     for x, v in equations.integral_of.items():
         mean, whole = (equations.mean(equations.parts[label]) for label in (v, x))
@@ -447,9 +447,22 @@ def carried(equations: Equations) -> dict[str, Reaction]:
                 continue
             if not _moving(slope) and _TERM not in symbols_of(slope):
                 out[v] = ((x, slope),)
-        elif equations.parts[v].symbol in symbols_of(whole) or simulators(equations.trace):
-            continue  # what it reads is shifted, or a step that is not known
-        elif x in equations.share_of_new:
+    return out
+
+
+def halfway(equations: Equations) -> dict[str, Reaction]:
+    """Label of a state -> what moves by half as much as in semi-implicit steps, since the row is
+    integrated: a push that is constant over a row of length h, and has made a speed of g by its
+    end, has moved the position by h g / 2."""
+    out: dict[str, Reaction] = {}
+    if simulators(equations.trace):  # a step that is not known
+        return out
+    known = carried(equations)
+    for x, v in equations.integral_of.items():
+        whole = equations.mean(equations.parts[x])
+        if not isinstance(whole, Expr) or v in known or x not in equations.share_of_new:
+            continue
+        if equations.parts[v].symbol not in symbols_of(whole):  # else it is moved by that
             out[v] = ((x, equations.share_of_new[x]),)
     return out
 

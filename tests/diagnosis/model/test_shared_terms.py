@@ -7,7 +7,7 @@ import ssmppl as ssm
 from ssmppl.analysis.density import Missing
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.model.equations import Equations, carried, shared_terms
+from ssmppl.diagnosis.model.equations import Equations, carried, halfway, shared_terms
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
@@ -206,7 +206,7 @@ def test_a_row_that_is_integrated_moves_the_position_by_half(dt):
     """Against the equation with the same constant force in it, to the higher orders of a row."""
     step = dt or DT
     plain = swung(lambda v: 0.0, dt)
-    ((label, factor),) = carried(Equations(plain))["v"]
+    ((label, factor),) = halfway(Equations(plain))["v"]
     given = symbols_of(factor)
     assert label == "x"
     assert [s.data[1] for s in given] == (["dt"] if dt else [])
@@ -230,6 +230,25 @@ def test_a_position_that_reads_the_new_speed_is_moved_once():
     equations = Equations(trace(model))
     assert equations.integral_of == {"x": "v"}
     assert carried(equations) == {}
+    assert halfway(equations) == {}
+
+
+def test_scores_leave_out_what_moves_halfway():
+    plain = swung(lambda v: 0.0)
+    found, _ = offers(plain, scales(plain), ["constant load"])
+    (c,) = [c for c in found if c.equation == "v"]
+    draw = {c.strength: 0.3}
+
+    def at(name):
+        rng = np.random.default_rng(len(draw))
+        return draw.setdefault(name, rng.uniform(-1.0, 1.0, 20))
+
+    before = means(plain, at)
+    whole, scored = (means(augment(plain, [c], first_order=f), at) for f in (False, True))
+    np.testing.assert_allclose(whole["x"] - before["x"], DT / 2 * 0.3, rtol=0.02)
+    assert np.array_equal(scored["x"], before["x"])
+    for one in (whole, scored):
+        np.testing.assert_allclose(one["v"] - before["v"], 0.3, rtol=1e-12)
 
 
 # -- what holds a state back
