@@ -29,6 +29,7 @@ from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
+from ssmppl.diagnosis.selection.backward import needed_only
 from ssmppl.diagnosis.selection.equivalence import FORM
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.input_delays import promising_delays
@@ -153,7 +154,16 @@ class EffectSelection:
                 pair = out.chosen
                 with guard("whether a third effect is missing"):
                     self._forward(out, self.most)
-        out.fewer = [r for r in (single, pair) if r is not None and r is not out.chosen]
+            if len(out.chosen.candidates) > 1 and self.further:
+                with guard("whether all effects are still needed"):
+                    out.chosen = needed_only(
+                        self.augmented, self.screen, out.chosen, self.train,
+                        self._seed(Choice.BACKWARD), self.checkpoint, "leaving out effects",
+                        out.simulation,
+                    )  # fmt: skip
+        strengths = {c.strength for c in out.chosen.candidates}
+        out.fewer = [r for r in (single, pair) if r is not None and r is not out.chosen
+                     and {c.strength for c in r.candidates} < strengths]  # fmt: skip
         if self.approximate:
             return
         if len(out.chosen.candidates) > 1:
