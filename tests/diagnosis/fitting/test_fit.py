@@ -199,6 +199,7 @@ def test_of_a_simulator_what_has_no_top_is_no_information(monkeypatch, curvature
     monkeypatch.setattr(Fitter, "_extended_of_many", lambda *_: "calls")
     monkeypatch.setattr(Fitter, "_curvature", lambda *_: curvature)
     monkeypatch.setattr(Fitter, "_simulated_information", lambda *_: np.eye(2))
+    monkeypatch.setattr(Fitter, "_extended_log_likelihood", lambda *_: None)
     fitter = object.__new__(Fitter)
     fitter.kalman = NotApplicable("it calls a simulator")
     some = dict.fromkeys(Fit.__dataclass_fields__)
