@@ -154,7 +154,7 @@ class EffectSelection:
                 pair = out.chosen
                 with guard("whether a third effect is missing"):
                     self._forward(out, self.most)
-            if len(out.chosen.candidates) > 1 and self.further:
+            if len(out.chosen.candidates) > 1 and self.further and not self.approximate:
                 with guard("whether all effects are still needed"):
                     out.chosen = needed_only(
                         self.augmented, self.screen, out.chosen, self.train,
@@ -403,7 +403,10 @@ class EffectSelection:
             ]  # fmt: skip
             if not more:
                 return
-            best = preferred(more, worth)[0]
+            # No formula is the machine's own: what describes any misfit goes on gaining beside it.
+            causes = [r for r in more if r.candidates[-1].effect.cause == MECHANISM
+                      and r.score >= FORM * chosen.score]  # fmt: skip
+            best = preferred(causes or more, worth)[0]
             if best.score < FORM * chosen.score:
                 out.notes.append(
                     f"not included: {best.candidates[-1]}, which gains "

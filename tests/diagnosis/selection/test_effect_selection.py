@@ -322,7 +322,7 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
         more = most - len(out.chosen.candidates)
         out.chosen = replace(out.chosen, candidates=out.chosen.candidates + (effect,) * more)
 
-    effect = SimpleNamespace(effect=SimpleNamespace(cause="mechanism"))
+    effect = SimpleNamespace(effect=SimpleNamespace(cause="mechanism"), strength="one")
     one = Refit((0,), (effect,), None, None, 9.0)
     monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
     monkeypatch.setattr(EffectSelection, "_best_pair", lambda *_: None)
