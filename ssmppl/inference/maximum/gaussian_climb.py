@@ -53,6 +53,7 @@ from ssmppl.language.model.trace import Trace
 REACH = 1.0  # standard deviations by which the points lie off the top
 FINE = 0.02  # and those of the differences that give the slope of L
 ROUNDS = 8
+WIDENINGS = 3  # of the differences for the information, where the likelihood jumps
 FAR = 0.5  # standard deviations of a step after which the information is looked at again
 LEAST_CURVATURE = 0.25  # of the likelihood, in that of L
 HALVINGS, TOLERANCE = 8, 1e-6  # of a step that leads downhill; nats that do not count
@@ -63,6 +64,7 @@ HOPELESS = 1.5  # and from which there is no correction
 FEWEST = 50  # particles
 KNOWN = 1e-4  # information in z from which a direction is looked into: a standard error of 100
 FURTHER = 2  # starts more, where a climb has not come to a top
+CONVERGED = 1.0  # nats that a rest is worth, beside a height that is estimated
 
 Approximate = LaplaceLikelihood | ExtendedLikelihood
 
@@ -70,8 +72,9 @@ Approximate = LaplaceLikelihood | ExtendedLikelihood
 def climb_gaussian(
     setup: Maximization, method: DirectOptimization, found: GaussianApproximation
 ) -> Ascent:
-    """The ascent by Laplace's log-likelihood; by the extended Kalman filter's where the model has
-    corners. Where one comes to no top the other is tried, and the better of them returned.
+    """The ascent by Laplace's log-likelihood, by the extended Kalman filter's where that comes to
+    no top; with corners by the filter's first, by Laplace's where that is not corrected. Where both
+    are left, the higher end.
 
     Raises
     ------
@@ -82,9 +85,9 @@ def climb_gaussian(
         LaplaceLikelihood(problem, found), ExtendedLikelihood(problem, found)
     ]  # fmt: skip
     bent = has_corners(problem.trace)
-    if bent:
+    if bent:  # which makes Laplace's slow to fail
         order.reverse()
-    ends: list[Ascent] = []
+    ends: list[tuple[float, Ascent]] = []
     for approximate in order:
         one = GaussianClimb(setup, method, approximate)
         try:
@@ -93,10 +96,19 @@ def climb_gaussian(
             if approximate is order[-1] and not ends:
                 raise
             continue
-        if end.interrupted or end.report["converged"] or (one.arrived and not bent):
+        corrected = end.report["converged"] and end.log_likelihood is not None
+        if end.interrupted or corrected or (one.arrived and not bent):
             return end
-        ends.append(end)
-    return max(ends, key=lambda end: bool(end.report["converged"]))
+        ends.append((_height(setup, one, end), end))
+    return max(ends, key=lambda pair: pair[0])[1]
+
+
+def _height(setup: Maximization, climb: GaussianClimb, end: Ascent) -> float:
+    """What the objective is at the end, by the approximation where it was not corrected."""
+    if end.log_likelihood is None:
+        return climb.best_value
+    prior = setup.log_prior(setup.space_at(end.theta))
+    return end.log_likelihood + prior + CONVERGED * bool(end.report["converged"])
 
 
 def has_corners(trace: Trace) -> bool:
@@ -232,7 +244,29 @@ class GaussianClimb:
             found = information_by_slope(self.slope, z)
             if np.all(np.isfinite(found)):
                 return found
-        return information_at(self.objective, z)
+        found = information_at(self.objective, z)
+        for _ in range(WIDENINGS if self.approximate.jumps else 0):
+            found = self._over_a_deviation(z, found)
+        return found
+
+    def _over_a_deviation(self, z: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """The same by differences over about one standard deviation, as differences over less take
+        a jump for a bend; as it was where that makes no top."""
+        if not np.all(np.isfinite(information)) or np.linalg.eigvalsh(information)[0] < KNOWN:
+            return information
+        axes = axes_of(information)
+        steps, n = REACH * axes.T, len(z)
+        here, bent = self.objective(z), np.zeros((n, n))
+        for i in range(n):
+            bent[i, i] = self.objective(z + steps[i]) - 2.0 * here + self.objective(z - steps[i])
+            for j in range(i):
+                signs = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+                f = [self.objective(z + a * steps[i] + b * steps[j]) for a, b in signs]
+                bent[i, j] = bent[j, i] = (f[0] + f[1] - f[2] - f[3]) / 4.0
+        inverse = np.linalg.inv(axes)
+        found = -inverse.T @ bent @ inverse / REACH**2
+        well = np.all(np.isfinite(found)) and np.linalg.eigvalsh(found)[0] > KNOWN
+        return found if well else information
 
     def log_likelihood(self, z: np.ndarray) -> float:
         """The approximation's; -inf off the support."""

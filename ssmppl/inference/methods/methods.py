@@ -272,9 +272,10 @@ class DirectOptimization:
     and where states have no noise. Else, where the states are driven by Gaussian noise and the
     observations' density is twice differentiable, by way of Laplace's approximation of the
     likelihood (Kristensen, Nielsen, Berg, Skaug and Bell 2016), whose top is then moved to that of
-    the likelihood by twisted particle filters with common random numbers. Else, for one scalar
-    state, over a particle filter with common random numbers that is continuous in the parameters
-    (Malik and Pitt 2011).
+    the likelihood by twisted particle filters with common random numbers; by way of the extended
+    Kalman filter's first, where a transition or an observation has corners in the states. Else, for
+    one scalar state, over a particle filter with common random numbers that is continuous in the
+    parameters (Malik and Pitt 2011).
 
     Parameters
     ----------
@@ -284,7 +285,8 @@ class DirectOptimization:
         the likelihood is exact, and where a climb of Laplace's comes to no top, else 0; where the
         states take finitely many values 24 short climbs, the best 3 of which are gone on with.
     steps : most iterations of a climb of an exact likelihood or of the continuous filter's.
-    laplace : whether to go by way of Laplace's approximation where there is one.
+    laplace : whether to go by way of Laplace's approximation, or the extended Kalman filter's,
+        where there is one.
     """
 
     particles: int = setting(1000, count(2))
