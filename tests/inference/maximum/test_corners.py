@@ -128,11 +128,12 @@ def tanks():
     return model
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.parametrize("seed", [3, 4, 6])
 def test_a_top_at_an_edge_that_is_not_corrected_is_not_the_last_word(seed):
-    """The extended filter's likelihood has a top at r = 0, twelve nats below the other one."""
+    """On these records the climb by the extended filter's likelihood ends at one, ten nats and more
+    below Laplace's."""
     model, at = tanks(), {"a": 0.2, "b": 0.22, "h": 1.0, "q": 0.01, "r": 0.02}
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
     x = w = 0.5
     u, y = np.zeros(80), np.zeros(80)
     for t in range(80):
@@ -141,7 +142,7 @@ def test_a_top_at_an_edge_that_is_not_corrected_is_not_the_last_word(seed):
         flow, noise = at["a"] * np.sqrt(max(x, 0.0)), at["q"] * rng.standard_normal(2)
         over = max(x - at["h"], 0.0)
         x, w = x + u[t] - flow - over + noise[0], w + flow - at["b"] * np.sqrt(w) + noise[1]
-    found = ssm.maximize(model, {"u": u, "y": y}, seed=seed, progress=False)
+    found = ssm.maximize(model, {"u": u, "y": y}, seed=0, progress=False)
     true = ssm.log_likelihood(model, {"u": u, "y": y}, at, particles=2000, seed=1)[0]
     assert found.attrs["converged"]
     assert found.log_likelihood > true
