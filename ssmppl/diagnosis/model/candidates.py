@@ -185,7 +185,8 @@ def _wanted(effect: Effect) -> str:
 
 def _parts(effect: Effect, equations: Equations) -> list[Part]:
     """The parts that an effect is bound to, by its kind and `on`."""
-    parts = [p for p in equations.parts.values() if p.role in BOUND_TO[effect.kind]]
+    parts = [p for p in equations.parts.values()
+             if p.role in BOUND_TO[effect.kind] and not _is_clock(p, equations)]  # fmt: skip
     on = effect.on
     if on not in ON:
         return [p for p in parts if on in (p.label, p.name)]
@@ -197,6 +198,12 @@ def _parts(effect: Effect, equations: Equations) -> list[Part]:
         return [p for p in parts if p.role == on]
     positive = on == "positive parameter"
     return [p for p in parts if p.role == "parameter" and _positive(p, equations) == positive]
+
+
+def _is_clock(part: Part, equations: Equations) -> bool:
+    """Whether it is the model's time step, which nothing acts on or through."""
+    step = equations.trace.time_step
+    return part.role == "input" and step is not None and part.name == step[0]
 
 
 def _positive(part: Part, equations: Equations) -> bool:
@@ -299,7 +306,7 @@ def _options(what: str, part: Part, equations: Equations) -> list[str] | str:
         labels = [p.label for p in equations.of_role("state") if p.label != part.label]
         return labels or "the model has no other state"
     if what == "any input":
-        labels = [p.label for p in equations.of_role("input")]
+        labels = [p.label for p in equations.of_role("input") if not _is_clock(p, equations)]
         return labels or "the model has no input"
     position = equations.position(part)
     if position is None:

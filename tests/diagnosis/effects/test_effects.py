@@ -292,6 +292,22 @@ def test_shapes_are_relative_to_the_variable():
     assert dates == [100, 200, 300, 400, 500]
 
 
+def test_a_time_step_is_no_input_that_acts():
+    """A friction "dependent on the load dt" stood among the first on a record of uneven rows."""
+    model = ssm.Model("cart", inputs=("u",), time_step="dt")
+    model.prior(lambda: {"c": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"v": ssm.Normal(0, sd=1)})
+    model.transition(lambda v, u, dt, c: {"v": ssm.Normal(v + dt * (u - c * v), sd=1)})
+    model.observation(lambda v: {"y": ssm.Normal(v, sd=1)})
+    t = trace(model)
+    found, refused = offers(t, scales(t))
+    assert any(c.equation == "u" for c in found)
+    assert any("u" in dict(c.bound).values() for c in found)
+    for c in found:
+        assert "dt" not in (c.equation, *c.alike, *dict(c.bound).values()), c
+    assert not [r for r in refused if r.equation == "dt"]
+
+
 def test_a_variable_that_does_not_vary_has_no_shapes():
     t = traced("gap", "oscillator")
     still = Scales.of(t, np.zeros((50, 2)), np.ones((50, 1)), np.ones((50, 1)), 50)

@@ -91,6 +91,14 @@ def test_the_force_on_a_rate_is_found_where_it_is_said():
     assert "through" not in str(drag(model_of(unsaid))[1])
 
 
+def test_a_friction_that_holds_is_not_offered_where_a_force_acts():
+    """Its strength is in the state's unit, and a simulator takes a force."""
+    _traced, found = offered(model_of(), ["coulomb friction"])
+    assert {c.effect.form for c in found} == {""}
+    _, found = offered(model_of(unsaid), ["coulomb friction"])
+    assert {c.effect.form for c in found} == {"", "sticking"}
+
+
 def test_the_augmented_model_pushes_inside_of_the_step():
     """Its transition at a point is the simulator's with the friction among its forces."""
     traced, candidate = drag(model_of())
