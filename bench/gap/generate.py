@@ -4,9 +4,9 @@
 
 `sets/<id>/` holds what a user has: `data.csv` and `model.py`. `answers/<id>.txt` holds the sealed
 answer. `digests.csv` (committed) holds the digests of both; `--check` makes the sets again and
-compares, which needs the NumPy version under which they were made. Answers of the first two halves
-hold every digit of the parameters, the last of which depends on the processor; `--check` says apart
-which data differ and which answers. Those of the sealed half hold twelve digits.
+compares, which needs the NumPy version under which they were made, and says apart which data differ
+and which answers. Answers hold twelve digits of the parameters: those after them depend on the
+processor.
 
 A set with a wrong starting value has a model whose priors of the physical constants are centred on
 three times the usual guesses; one with a wrong noise scale has priors of the noise scales centred
@@ -55,7 +55,7 @@ def made(entry: Entry, table: dict[str, dict]) -> tuple[str, str, dict]:
     U, _, Y = system.recorded(p, e, system.excite(rng, system.steps), rng)
     if not np.isfinite(Y).all():
         raise ValueError(f"{entry.id}: the true system {system.name} left the numbers")
-    parameters = dict(zip(system.parameters, told(entry, p), strict=True))
+    parameters = dict(zip(system.parameters, told(p), strict=True))
     return data_text(system, U, Y), model_text(entry), answer_of(entry, parameters, chosen)
 
 
@@ -73,9 +73,9 @@ def answer_of(entry: Entry, parameters: dict[str, float], strengths: dict[str, f
     }
 
 
-def told(entry: Entry, p: np.ndarray) -> list[float]:
+def told(p: np.ndarray) -> list[float]:
     """True parameters as an answer holds them."""
-    return [float(f"{v:.12g}") for v in p] if entry.half == "sealed" else p.tolist()
+    return [float(f"{v:.12g}") for v in p]
 
 
 def described(system: str, key: str, strength: float) -> dict:
@@ -157,7 +157,7 @@ def main() -> None:
             ):
                 if was != now:
                     differing[kind].append(name)
-        elif known.get(name, ("", ""))[0] != data:  # the last digits of an answer are the machine's
+        else:
             known[name] = data, answer
     if not options.check:
         lines = ["id,set,answer", *(f"{k},{a},{b}" for k, (a, b) in sorted(known.items()))]
