@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.errors import Location
+from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array, elementwise, inverse, log_determinant
 from ssmppl.expressions.expr import Expr, apply, as_expr, attributed, constant
 from ssmppl.language.distributions.multivariate import Centred, surely_positive, where_definite
@@ -23,10 +23,14 @@ class Missing:
 
     none : every entry was measured, so no term is ever left out.
     partial : names of channels with a joint distribution of which single components are missing.
+    noise, spread : why an observation, and why the states have no density in some row; None where
+        they have one in all.
     """
 
     none: bool = False
     partial: frozenset[str] = frozenset()
+    noise: NotApplicable | None = None
+    spread: NotApplicable | None = None
 
 
 @dataclass(frozen=True)

@@ -298,7 +298,8 @@ def _gaussian_law(
 
 def singular_covariance(trace: Trace) -> NotApplicable | None:
     """Why the states have no joint density beside their Dirac components: a covariance that is
-    singular whatever the parameters are, or in some cases of the conditions in it."""
+    singular whatever the parameters are, in some cases of the conditions in it, or in some row of
+    the data; or why they have none with the observations: one without noise in some row."""
     for role, sites in (("initial distribution", trace.initial), ("transition", trace.transition)):
         for site in sites.values():
             root = site.distribution.root if isinstance(site.distribution, MvNormal) else None
@@ -315,7 +316,7 @@ def singular_covariance(trace: Trace) -> NotApplicable | None:
                     "that its density does not exist",
                     site.distribution.location,
                 )
-    return None
+    return trace.noiseless_row if trace.singular_row is None else trace.singular_row
 
 
 @once_per_trace

@@ -35,7 +35,7 @@ from ssmppl.expressions.expr import (
     without_exponentials,
 )
 from ssmppl.expressions.loops.slopes import loop_slopes
-from ssmppl.expressions.properties import never_negative
+from ssmppl.expressions.properties import may_vanish_by_data, never_negative
 
 Partial = Callable[..., Sequence[Expr | float | None]]
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
@@ -396,22 +396,33 @@ def _matrix_tangent(node: Expr, tangent: dict[Expr, _Slope]) -> ExprArray:
     # d L = L Phi(L^-1 dA L^-T), Phi: lower half with halved diagonal; dA symmetric from its lower
     lower = array(np.tril(array(item)))
     symmetric = array(np.tril(d) + np.tril(d, -1).T)
-    inv = lower_inverse(lower)
+    inv = lower_inverse(lower, may_vanish_by_data(node.args))
     middle = inv @ symmetric @ inv.T
     return lower @ array(np.tril(middle) * (1.0 - 0.5 * np.eye(n)))
 
 
-def lower_inverse(lower: ExprArray) -> ExprArray:
-    """Inverse of a lower triangular matrix by forward substitution, written out."""
+def lower_inverse(lower: ExprArray, singular: bool = False) -> ExprArray:
+    """Inverse of a lower triangular matrix by forward substitution, written out.
+
+    singular : whether columns may be zero, as those of a factor of a singular covariance are; their
+        rows of the inverse are zero then. The inverse times L z is z but for what L leaves out.
+    """
     n = len(lower)
     out = np.full((n, n), constant(0.0), dtype=object)
-    for j in range(n):
-        out[j, j] = 1.0 / lower[j, j]
-        for i in range(j + 1, n):
+    for i in range(n):
+        pivot = lower[i, i]
+        if singular and pivot is constant(0.0):
+            continue
+        row = []
+        for j in range(i):
             total = constant(0.0)
             for k in range(j, i):
                 total = total + lower[i, k] * out[k, j]
-            out[i, j] = -total / lower[i, i]
+            row.append(-total / pivot)
+        row.append(1.0 / pivot)
+        if singular:
+            row = [apply("where", apply("lt", 0.0, pivot), value, 0.0) for value in row]
+        out[i, : i + 1] = row
     return array(out)
 
 
@@ -537,7 +548,7 @@ def _of_matrix(node: Expr, slope: ExprArray) -> list[Expr]:
         return list(array(-(x.T @ slope @ x.T)).ravel())
     lower = array(np.tril(array(item)))
     middle = array(np.tril(lower.T @ array(np.tril(slope))) * (1.0 - 0.5 * np.eye(n)))
-    inv = lower_inverse(lower)
+    inv = lower_inverse(lower, may_vanish_by_data(node.args))
     whole = inv.T @ middle @ inv
     # d A symmetric from its lower half: both entries off the diagonal count for the lower one
     return list(array(np.tril(whole) + np.tril(whole.T, -1)).ravel())

@@ -449,16 +449,20 @@ def _bare(a: Expr) -> Expr:
     return a
 
 
-def to_text(root: Expr, longest: int = LONGEST) -> str:
+def to_text(root: Expr, longest: int = LONGEST, done: dict[Expr, Text] | None = None) -> str:
     """The expression as a person writes it.
 
     Written out, an expression that shares its parts can be exponentially longer than its graph:
     what has more than `longest` characters is cut, with a mark that differs where the rest does.
+
+    done : the texts of expressions that were written so, with the same `longest`; completed.
     """
     if root.op == "symbol":
         return symbol_text(root)
-    done: dict[Expr, Text] = {}
-    for node in topological([root]):
+    done = {} if done is None else done
+    for node in topological([root], until=done):
+        if node in done:
+            continue
         args = map(_bare, node.args) if node.op == "gammaln" else node.args
         text, level = done[node] = _written(node, [done[a] for a in args])
         if len(text) > longest:

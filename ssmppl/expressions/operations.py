@@ -197,7 +197,7 @@ BOOLEAN = frozenset(("lt", "le", "eq", "ne", "and", "or", "not"))
 # Operations on a matrix, whose n * n entries, row by row, are the operands: how users write them,
 # and their meaning, a function of a stack of matrices. Kernels have the same names.
 MATRICES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
-    "cholesky": ("np.linalg.cholesky({0})", np.linalg.cholesky),
+    "cholesky": ("np.linalg.cholesky({0})", special.factor_of_semidefinite),
     "inverse": ("np.linalg.inv({0})", np.linalg.inv),
     "logdet": ("np.linalg.slogdet({0})[1]", lambda a: np.linalg.slogdet(a)[1]),
     "det": ("np.linalg.det({0})", np.linalg.det),

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, is_tuple, topological
+from ssmppl.expressions.expr import Expr, is_tuple, symbols_of, topological
 from ssmppl.expressions.node import BOOLEAN, SEVERAL
+
+DATA = {"input", "input_prev", "time", "time_prev", "observation_prev"}  # kinds of symbols
 
 _OF_ANY = {"exp", "abs", "sqrt"}  # none below 0, of whatever number
 _OF_SUCH = {"add", "mul", "div", "maximum", "minimum"}  # of such numbers such a number
@@ -41,6 +43,12 @@ def never_negative(e: Expr) -> bool:
     if e.op == "where":
         return all(map(never_negative, e.args[1:]))
     return e.op in _OF_SUCH and all(map(never_negative, e.args))
+
+
+def may_vanish_by_data(spread: Iterable[Expr]) -> bool:
+    """Whether data enter a variance or a covariance, which may then be singular in some rows: a
+    step of no length, an input that switches a noise off."""
+    return any(s.data[0] in DATA for s in symbols_of(spread))
 
 
 def conditions_of(forms: Iterable[Expr]) -> list[Expr]:

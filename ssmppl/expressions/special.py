@@ -1,4 +1,5 @@
-"""Functions of probability that SciPy has not as ufuncs, for the interpreter: arrays in, array out.
+"""Functions of probability that SciPy has not as ufuncs, and the Cholesky factor of a singular
+matrix, which NumPy has not, for the interpreter: arrays in, array out.
 
 The compiled kernels (`codegen/kernels/math/special.py`) compute the same by other ways.
 """
@@ -15,6 +16,7 @@ BISECTIONS = 80
 LARGEST_COUNT = 2.0**53
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 PIECES = 6
+PIVOT = 1e-13  # of a variance, below which what is left of it is taken for rounding
 FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
 
 
@@ -199,3 +201,34 @@ def vonmises_quantile(concentration: Any, q: Any) -> np.ndarray:
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     sound = (kappa >= 0) & (kappa < np.inf) & (q >= 0) & (q <= 1)
     return np.where(sound, np.where(q <= 0.5, high, -high), np.nan)
+
+
+def factor_of_semidefinite(matrices: np.ndarray) -> np.ndarray:
+    """Lower factors L (..., n, n) of symmetric positive semidefinite matrices, L L' = the matrix.
+
+    A pivot of zero, but for rounding, leaves a column of zeros (Higham 2002, "Accuracy and
+    stability of numerical algorithms", section 10.3), as in the kernel `cholesky`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError : one of the matrices is not positive semidefinite.
+    """
+    try:
+        return np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        left = np.array(matrices, dtype=float)
+    n = left.shape[-1]
+    scale, root = np.diagonal(left, axis1=-2, axis2=-1).copy(), np.zeros_like(left)
+    for j in range(n):
+        pivot, column = left[..., j, j].copy(), left[..., j + 1 :, j].copy()
+        least = PIVOT * scale[..., j]
+        gone = (pivot <= 0.0) & (pivot >= -least)
+        gone &= (column**2 <= least[..., None] * scale[..., j + 1 :]).all(axis=-1)
+        if not np.all(gone | (pivot > 0.0)):
+            raise np.linalg.LinAlgError("Matrix is not positive semidefinite")
+        own = np.sqrt(np.where(gone, 1.0, pivot))
+        root[..., j, j] = np.where(gone, 0.0, own)
+        root[..., j + 1 :, j] = np.where(gone[..., None], 0.0, column / own[..., None])
+        part = root[..., j + 1 :, j]
+        left[..., j + 1 :, j + 1 :] -= part[..., :, None] * part[..., None, :]
+    return root

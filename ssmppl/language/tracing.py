@@ -32,9 +32,16 @@ from ssmppl.language.checks.rules import (
     check_states,
 )
 from ssmppl.language.distributions.base import Distribution
+from ssmppl.language.distributions.multivariate import MvNormal
 from ssmppl.language.distributions.vectors.correlations import with_unit_diagonal
 from ssmppl.language.model.calling import call, call_once, check_outer_names, return_location
-from ssmppl.language.model.covariances import by_noise, find_root, independent, noiseless
+from ssmppl.language.model.covariances import (
+    by_noise,
+    find_root,
+    independent,
+    noiseless,
+    without_density,
+)
 from ssmppl.language.model.model import Model, location_of
 from ssmppl.language.model.trace import EXPERIMENT_NUMBER, Site, Trace, symbols
 from ssmppl.language.user_defined.sde import noises, started
@@ -93,14 +100,15 @@ def _by_noise(sites: Mapping[str, Site], proposal: Mapping[str, Site]) -> dict[s
     return {site.name: site for own in parts for site in own}
 
 
-def _no_noise(name: str, law: Distribution, role: str) -> ModelError:
-    k = noiseless(law)[0]
+def _no_density(name: str, law: MvNormal, role: str) -> ModelError:
     fix = "give it a variance, or leave the component out; only states may be without noise"
     if role == "proposal":
         fix = "leave @proposal out, and one is derived"
+    still = noiseless(law)
+    what = f"has a row of zeros, that of component {still[0]}" if still else "is singular"
+    which = "such a component" if still else "it"
     return ModelError(
-        f"the covariance of {name!r} in @{role} has a row of zeros, that of component {k}: such a "
-        "component has no density",
+        f"the covariance of {name!r} in @{role} {what}: {which} has no density",
         fix=fix,
         where=law.location,
     )
@@ -207,10 +215,12 @@ class _Tracer:
                     distribution = independent(distribution)
                 elif function in self.model.per_experiment:
                     distribution = self._of_each(name, distribution, line)
-                if function_role in ("initial", "transition"):
+                bare = without_density(distribution)
+                states = function_role in ("initial", "transition")
+                if bare is not None and (not states or bare is not distribution):
+                    raise _no_density(name, bare, function_role)
+                if states:
                     find_root(distribution)
-                elif noiseless(distribution):
-                    raise _no_noise(name, distribution, function_role)
                 if name in sites:
                     if self.model._forgets(function_role, givers[name], function):
                         raise _Redefined

@@ -6,8 +6,9 @@ from scipy.stats import multivariate_normal
 import ssmppl.language.distributions as D
 from ssmppl.data import bind, check_parameters
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.evaluate import numbers
+from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.model.model import Model
+from ssmppl.language.model.trace import symbols
 from ssmppl.language.tracing import trace
 
 
@@ -131,12 +132,26 @@ MODELS = [scalar, time_varying, deterministic, feedback, noiseless_start]
 
 # -- the same laws as one dense Gaussian
 def law(model, role, known, components):
-    """Mean and covariance of one role at plain numbers, over `components` (name, index)."""
+    """Mean and covariance of one role at numbers, over `components` (name, index).
+
+    The numbers stand for symbols, as a spread that is written as zero is refused.
+    """
     mean, covariance = [], {}
-    place = {}
+    place, values = {}, {}
+
+    def given(name):
+        value = np.asarray(known[name])
+        square = value.ndim == 2 and value.shape[0] == value.shape[1]
+        own = symbols("given", name, value.shape, square and bool(np.all(value == value.T)))
+        values.update(zip(own.ravel(), np.ravel(known[name]), strict=True))
+        return own if own.shape else own[()]
+
+    def numbers(expressions):
+        return np.array(evaluate(list(expressions), values), dtype=float)
+
     for function in model.functions[role]:
         wanted = function.__code__.co_varnames[: function.__code__.co_argcount]
-        for name, d in function(**{n: known[n] for n in wanted}).items():
+        for name, d in function(**{n: given(n) for n in wanted}).items():
             own = [place.setdefault((name, i), len(place)) for i in np.ndindex(d.shape)]
             mean += list(numbers(array(d.mean()).ravel()))
             if isinstance(d, D.MvNormal):
@@ -164,6 +179,12 @@ def by_name(components, values):
         n: items[()] if () in items else np.array([items[(i,)] for i in range(len(items))])
         for n, items in out.items()
     }
+
+
+def root(covariance):
+    """L with L L' = a covariance, which may be singular."""
+    value, vector = np.linalg.eigh(covariance)
+    return vector * np.sqrt(np.maximum(value, 0.0))
 
 
 class Dense:
@@ -194,8 +215,7 @@ class Dense:
                 slope = np.array([mean(e)[0] - centre for e in np.eye(d + k)]).T
                 past = [np.concatenate([self.x[-1][i], self.y[-1][i]]) for i in (0, 1)]
                 x = [centre + slope @ past[0], slope @ past[1]]
-            value, vector = np.linalg.eigh(cov)
-            noise[:, t * (d + k) : t * (d + k) + d] = vector * np.sqrt(np.maximum(value, 0.0))
+            noise[:, t * (d + k) : t * (d + k) + d] = root(cov)
             self.x.append([x[0], x[1] + noise])
 
             def seen_mean(v, known=known):
@@ -206,7 +226,7 @@ class Dense:
             centre, cov = seen_mean(np.zeros(d))
             slope = np.array([seen_mean(e)[0] - centre for e in np.eye(d)]).T
             noise = np.zeros((k, size))
-            noise[:, t * (d + k) + d : (t + 1) * (d + k)] = np.linalg.cholesky(cov)
+            noise[:, t * (d + k) + d : (t + 1) * (d + k)] = root(cov)
             self.y.append([centre + slope @ self.x[-1][0], slope @ self.x[-1][1] + noise])
 
     def measured(self, seen, upto):

@@ -51,6 +51,7 @@ from ssmppl.expressions.expr import (
     symbols_of,
     topological,
 )
+from ssmppl.expressions.properties import may_vanish_by_data
 from ssmppl.language.distributions import Draws
 from ssmppl.language.distributions.continuous import LOG_2PI
 from ssmppl.language.distributions.multivariate import surely_positive, where_definite
@@ -277,7 +278,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
             r = mask_covariance(r, masks)
         draw, predictive = _condition(block, h, r, residual, masks)
         if not sure:  # the sum of the covariances of x and of no law may be one all the same
-            predictive = where_definite(array(r), predictive)
+            predictive = where_definite(array(r), predictive, may_vanish_by_data(r.ravel()))
         return split.complete(draw), predictive
 
     draw, predictive = law(transition)

@@ -18,6 +18,8 @@ from ssmppl.language.model.trace import Trace
 
 def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
     """None where the continuous filter applies, else the reason why not."""
+    if trace.noiseless_row is not None:
+        return trace.noiseless_row
     if len(trace.state_symbols) != 1:
         return NotApplicable(
             f"the state has {len(trace.state_symbols)} components, and only one can be sorted"

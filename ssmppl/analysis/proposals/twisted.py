@@ -45,7 +45,8 @@ from ssmppl.expressions.calculus import (
     lower_inverse,
 )
 from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, symbol
-from ssmppl.language.distributions import Dirac, Draws, MvNormal
+from ssmppl.expressions.properties import may_vanish_by_data
+from ssmppl.language.distributions import Dirac, Draws, LogNormal, MvNormal
 from ssmppl.language.model.trace import Site, Trace
 
 DEFENSIVE = 0.02  # share of the transition in the proposal's mixture
@@ -132,19 +133,30 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
             kind = type(d).__name__
             reason = f"the distribution of {site.name} is {kind}, not driven by Gaussian noise"
             return NotApplicable(reason, d.location)
-        if isinstance(d, MvNormal) and d.root is not None:
-            reason = (
-                f"the covariance of {site.name} is singular, so that the noise cannot be recovered "
-                "from the state"
-            )
-            return NotApplicable(reason, d.location)
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         noise += new
         sample = drawn(site, GivenDraws(site.name, new)).ravel()
         value.update(zip(own, sample, strict=True))
-        recovered += list(d.standard(site.value).ravel())
+        recovered += _recovered(d, site.value)
     value = resolved(value)
     return NoiseForm(tuple(noise), array([value[s] for s in states]), array(recovered))
+
+
+def _recovered(law: Any, value: ExprArray) -> list[Expr]:
+    """The standard normal draws behind a value; 0 for those that move nothing, as of a covariance
+    that is singular, in all rows or where the data leave it so. Twisted and not, such a draw has
+    the same distribution, so that its value does not count."""
+    if isinstance(law, MvNormal):
+        factor = law.factor()
+        singular = law.root is not None or may_vanish_by_data(factor.ravel())
+        if law.spread != "precision" and singular:
+            return list(lower_inverse(factor, singular=True) @ array(value - law.mean_))
+        return list(law.standard(value).ravel())
+    found = law.standard(value).ravel()
+    spread = law.sd.ravel() if isinstance(law, LogNormal) else law.sd().ravel()
+    if not may_vanish_by_data(spread):
+        return list(found)
+    return [apply("where", apply("lt", 0.0, s), e, 0.0) for s, e in zip(spread, found, strict=True)]
 
 
 class GivenDraws(Draws):

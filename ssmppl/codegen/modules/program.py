@@ -87,11 +87,15 @@ class Program:
     @once_property
     def gaussian(self) -> GaussianApproximation | NotApplicable:
         """The Gaussian approximation, in a module of its own; generated when first asked for."""
+        if self.missing.noise is not None:
+            return self.missing.noise
         return compile_gaussian(self.trace, self.missing)
 
     @once_property
     def twisted(self) -> TwistedFilter | NotApplicable:
         """The twisted filter, in a module of its own; generated when it is first asked for."""
+        if self.missing.noise is not None:
+            return self.missing.noise
         return compile_twisted(self.trace, self.missing, self.gaussian)
 
     @once_property
@@ -102,6 +106,8 @@ class Program:
     @once_property
     def tempered(self) -> TemperedFilter | NotApplicable:
         """The tempered filter, likewise."""
+        if self.missing.noise is not None:
+            return self.missing.noise
         return compile_tempered(self.trace, self.missing)
 
     def apart(self, proposal: str) -> bool:
@@ -217,7 +223,22 @@ def _compiled(trace: Trace, missing: Missing) -> Program:
     proposals = {**derive(trace, missing), "twisted": twisted(trace, missing)}
     out, lines = _write(trace, missing, proposals)
     loaded = load(out, identifier(trace.name), lines)
+    proposals = {n: _with_densities(p, missing) for n, p in proposals.items()}
     return Program(trace, missing, proposals, out.finish(lines), loaded.module, loaded)
+
+
+def _with_densities(
+    proposal: Proposal | NotApplicable, missing: Missing
+) -> Proposal | NotApplicable:
+    """The proposal, unless it asks for a density that does not exist in some row of the data: of
+    the observation, where it is what particles weigh, or of the states, where these are drawn by
+    Newton steps. Those that are conditioned on the observation in closed form ask for neither."""
+    if isinstance(proposal, NotApplicable) or proposal.exact_look_ahead:
+        return proposal
+    if missing.noise is not None:
+        return missing.noise
+    fitted = proposal.name in ("guided", "auxiliary")
+    return missing.spread if fitted and missing.spread is not None else proposal
 
 
 def _write(

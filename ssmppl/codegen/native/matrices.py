@@ -6,8 +6,11 @@ particles vectorises, and each gives the numbers of the kernel of its name in `m
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
+
+from ssmppl.codegen.kernels.math.scalars import PIVOT
 
 Let = Callable[[str], str]
 Rows = list[list[str]]
@@ -15,21 +18,31 @@ Rows = list[list[str]]
 # The largest n: lines of a Cholesky factor grow as n^3 / 6, of an elimination as 6 n^3.
 LARGEST = {"cholesky": 16, "inverse": 6, "logdet": 6, "det": 6}
 NAN, MINUS_INFINITY = "0x7FF8000000000000", "0xFFF0000000000000"
+ROUNDING = f"0x{struct.unpack('<Q', struct.pack('<d', PIVOT))[0]:016X}"
 
 
 def cholesky(let: Let, entries: Rows) -> Rows:
-    """The lower Cholesky factor; nan from the first pivot on that is not positive."""
+    """The lower Cholesky factor of a matrix that may be singular, as the kernel of this name."""
     a, n = [list(row) for row in entries], len(entries)
     for j in range(n):
+        least = let(f"fmul double {ROUNDING}, {a[j][j]}")
         for k in range(j):
             a[j][j] = _less_product(let, a[j][j], a[j][k], a[j][k])
-        positive = let(f"fcmp ogt double {a[j][j]}, 0.0")
-        root = let(f"call double @llvm.sqrt.f64(double {a[j][j]})")
-        a[j][j] = _either(let, positive, root, NAN)
+        low = let(f"fcmp ole double {a[j][j]}, 0.0")
+        high = let(f"fcmp oge double {a[j][j]}, {let(f'fneg double {least}')}")
+        gone = let(f"and i1 {low}, {high}")
         for i in range(j + 1, n):
             for k in range(j):
                 a[i][j] = _less_product(let, a[i][j], a[i][k], a[j][k])
-            a[i][j] = let(f"fdiv double {a[i][j]}, {a[j][j]}")
+            square = let(f"fmul double {a[i][j]}, {a[i][j]}")
+            most = let(f"fmul double {least}, {a[i][i]}")
+            gone = let(f"and i1 {gone}, {let(f'fcmp ole double {square}, {most}')}")
+        positive = let(f"fcmp ogt double {a[j][j]}, 0.0")
+        root = let(f"call double @llvm.sqrt.f64(double {a[j][j]})")
+        root = _either(let, positive, root, NAN)
+        for i in range(j + 1, n):
+            a[i][j] = _either(let, gone, "0.0", let(f"fdiv double {a[i][j]}, {root}"))
+        a[j][j] = _either(let, gone, "0.0", root)
     return a
 
 

@@ -18,9 +18,9 @@ from typing import Any
 from ssmppl.codegen.kernels.particle import particle_filter as kernels
 from ssmppl.codegen.text.callbacks import REQUESTS
 from ssmppl.codegen.text.render import (
+    Comments,
     Names,
     Writer,
-    comment,
     depends,
     symbol_name,
 )
@@ -73,7 +73,7 @@ class Layout:
     """
 
     def __init__(self, trace: Trace, guide: Sequence[Expr] = ()):
-        self.trace = trace
+        self.trace, self.comments = trace, Comments()
         self.place: dict[tuple[str, Expr], int] = {}
         order = {
             "parameter": trace.parameter_symbols,
@@ -210,7 +210,7 @@ class Section:
                 source = f"s[{k}]"
                 wanted = symbol_name(node) if node.op == "symbol" else f"s{k}"
             names[node] = reserved.fresh(wanted)
-            note = "" if node.op == "symbol" else f"  # {comment(node)}"
+            note = "" if node.op == "symbol" else f"  # {self.layout.comments.of(node)}"
             head.append(f"    {names[node]} = {source}{note}")
         return names
 
@@ -299,7 +299,7 @@ class Section:
                 if node in outer and node in inside and node.op != "symbol":
                     k = self.c.setdefault(node, len(self.c))
                     names[node] = reserved.fresh(f"c{k}")
-                    head.append(f"    {names[node]} = c[{k}]  # {comment(node)}")
+                    head.append(f"    {names[node]} = c[{k}]  # {self.layout.comments.of(node)}")
         head += self.layout.read(roots, names, reserved)
         writer = Writer(names, reserved, self.layout.trace.locations)
         writer.assign([(f"{array}[{k}]", node) for node, k in slots.items()])

@@ -230,10 +230,16 @@ def number_text(value: float) -> str:
     return repr(float(value))
 
 
-def comment(node: Expr, width: int = 60) -> str:
-    """The expression in the user's words, cut to a margin comment."""
-    text = to_text(node, longest=4 * width)
-    return text if len(text) <= width else text[: width - 3] + "..."
+class Comments:
+    """Expressions in the user's words, cut to margin comments; what many share is written once."""
+
+    def __init__(self, width: int = 60):
+        self.width = width
+        self._done: dict[Expr, Text] = {}
+
+    def of(self, node: Expr) -> str:
+        text = to_text(node, 4 * self.width, self._done)
+        return text if len(text) <= self.width else text[: self.width - 3] + "..."
 
 
 def depends(nodes: Iterable[Expr], level_of: Callable[[Expr], int]) -> dict[Expr, int]:

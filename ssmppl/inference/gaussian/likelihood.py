@@ -149,9 +149,10 @@ def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplic
 
 
 def approximation_of(
-    problem: Problem, kind: str, instead: str = 'use proposal="auto" or "bootstrap"'
+    problem: Problem, kind: str, instead: str | None = None
 ) -> GaussianApproximation:
-    """What gives "laplace", "extended" or "unscented"; instead : what to do where nothing does.
+    """What gives "laplace", "extended" or "unscented"; instead : what to do where nothing
+    does; None: as for any proposal.
 
     Raises
     ------
@@ -163,7 +164,9 @@ def approximation_of(
         found = points if isinstance(points, NotApplicable) else found
     if isinstance(found, NotApplicable):
         raise ArgumentError(
-            f"proposal={kind!r} does not apply: {found.reason}", fix=instead, where=found.where
+            f"proposal={kind!r} does not apply: {found.reason}",
+            fix=problem.instead if instead is None else instead,
+            where=found.where,
         )
     return found
 

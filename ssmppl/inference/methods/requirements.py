@@ -25,12 +25,17 @@ def need_density(trace: Trace, method: str, verb: str) -> None:
     if reason is None:
         return
     linear = not isinstance(linear_gaussian(trace), NotApplicable)
-    written = "write components that follow without a noise of their own as states of distribution "
-    written += "ssm.Dirac"
-    if verb in WITHOUT:
+    exact = reason is trace.noiseless_row
+    written = (
+        "give the observation some noise there"
+        if exact
+        else "write components that follow without a noise of their own as states of distribution "
+        "ssm.Dirac"
+    )
+    if verb in WITHOUT and not (exact and not linear and verb in ("maximize", "score")):
         written = f"use {WITHOUT[verb][0 if linear else 1]}, which needs none; or {written}"
     raise ArgumentError(
-        f"{method} needs the density of the states: {reason.reason}",
+        f"{method} needs {'densities' if exact else 'the density of the states'}: {reason.reason}",
         fix=written,
         where=reason.where,
     )

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.data import spelled
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.particles.filtering import (
@@ -130,7 +131,7 @@ def pilot_likelihood(
     """
     if proposal in EXACT:
         return lambda theta, _: exact_log_likelihood(problem.trace, problem.experiments, theta)
-    settings = FilterSettings(PILOT_PARTICLES, proposal, rescue=rescue)
+    settings = FilterSettings(PILOT_PARTICLES, _applicable(problem, proposal), rescue=rescue)
 
     def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
         try:
@@ -141,6 +142,14 @@ def pilot_likelihood(
     return estimate
 
 
+def _applicable(problem: Problem, proposal: str) -> str:
+    """The proposal, or another where an observation without noise rules the transition out."""
+    if proposal != "bootstrap" or problem.program.missing.noise is None:
+        return proposal
+    found = problem.program.proposals
+    return next((n for n, p in found.items() if isinstance(p, Proposal)), proposal)
+
+
 def averaged_density(
     space: Region, seed: np.random.SeedSequence, proposal: str, repeats: int, rescue: int = 0
 ) -> Callable[[np.ndarray], float]:
@@ -148,7 +157,7 @@ def averaged_density(
     likelihood with common random numbers (exact for `EXACT`)."""
     problem = space.problem
     exact = pilot_likelihood(problem, proposal) if proposal in EXACT else None
-    settings = FilterSettings(PILOT_PARTICLES, proposal, rescue=rescue)
+    settings = FilterSettings(PILOT_PARTICLES, _applicable(problem, proposal), rescue=rescue)
 
     def averaged(v: np.ndarray) -> float:
         theta, log_prior = space.parameters(v)

@@ -109,7 +109,7 @@ def choose_by_pilot(
     found = exact_model(problem.trace)
     if exact and not isinstance(found, NotApplicable):
         return Choice(filter_of(found), {})
-    if "user" in problem.program.proposals:
+    if isinstance(problem.program.proposals.get("user"), Proposal):
         return Choice("user", {})
     candidates = {
         n: p for n, p in problem.program.proposals.items()
@@ -125,8 +125,10 @@ def choose_by_pilot(
         candidates |= {
             n: p for n, p in found_marginal.proposals.items() if not isinstance(p, NotApplicable)
         }
+    if not candidates and not last and problem.program.missing.noise is not None:
+        problem.proposal("bootstrap")  # refused, with the row
     if len(candidates) == 1 and not last:
-        return Choice("bootstrap", {})
+        return Choice(next(iter(candidates)), {})
     flags = whole, integrate, temper, look_ahead
     key = (problem.program.path, digest_of(problem), theta.tobytes(), *flags)
     if key not in _choices:

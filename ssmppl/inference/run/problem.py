@@ -18,6 +18,7 @@ from ssmppl.codegen.modules.program import OWN_MODULES, Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.data.notices import warn_of
 from ssmppl.data.per_experiment import trace_over
+from ssmppl.data.singular_rows import of_data
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
@@ -79,6 +80,16 @@ class Problem:
         """The data sets as passes over all of them take them."""
         return EndToEnd.of(self.experiments)
 
+    @property
+    def instead(self) -> str:
+        """What to write for a proposal that does not apply."""
+        if self.program.missing.noise is None:
+            return 'use proposal="auto" or "bootstrap"'
+        return (
+            'use proposal="auto", which draws states given the observation where it can; or give '
+            "the observation some noise there"
+        )
+
     def proposal(self, name: str, integrate: bool = False, others: Sequence[str] = ()) -> Proposal:
         """A derived proposal.
 
@@ -105,7 +116,7 @@ class Problem:
                 fix=f"use one of: {listing(name, known)}",
             )
         if isinstance(found, NotApplicable):
-            fix = 'use proposal="auto" or "bootstrap"'
+            fix = self.instead
             if flat_start(self.trace):
                 fix = "use an exact method, or give the state a proper distribution in @initial"
             raise ArgumentError(f"proposal={name!r} does not apply: {found}", fix=fix)
@@ -119,11 +130,15 @@ class Problem:
         return found
 
 
-def missing_of(experiments: Sequence[Experiment]) -> Missing:
-    """What the data lack, as far as the generated code depends on it."""
+def missing_of(experiments: Sequence[Experiment], known: Trace | None = None) -> Missing:
+    """What the data lack, as far as the generated code depends on it.
+
+    known : the trace, as `of_data` gives it; None where densities do not matter.
+    """
     none = all(bool(np.all(e.seen == 1.0)) for e in experiments)
     partial: frozenset[str] = frozenset()
-    return Missing(none, partial.union(*(e.partial for e in experiments)))
+    lacking = (None, None) if known is None else (known.noiseless_row, known.singular_row)
+    return Missing(none, partial.union(*(e.partial for e in experiments)), *lacking)
 
 
 def pose(model: Model, data: Any, *, noting: bool = False) -> Problem:
@@ -145,4 +160,6 @@ def pose(model: Model, data: Any, *, noting: bool = False) -> Problem:
     experiments = tuple(bind(traced, data))
     if noting:
         warn_of(traced, data, experiments)
-    return Problem(traced, experiments, compile_trace(traced, missing_of(experiments)))
+    known = of_data(traced, experiments)
+    program = compile_trace(traced, missing_of(experiments, known))
+    return Problem(known, experiments, program)

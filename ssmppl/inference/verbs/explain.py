@@ -29,6 +29,7 @@ from ssmppl.arguments import checked
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.per_experiment import trace_over
+from ssmppl.data.singular_rows import of_data
 from ssmppl.data.times import label_text, spacing, trading_days
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
@@ -334,17 +335,19 @@ def explain(model: Model, data: Any = None) -> Plan:
     ModelError, DataError : what is wrong, where, and the fix.
     """
     traced = trace_over(model, data)
-    missing, bound, rows = Missing(none=True), "", None
+    bare, missing, bound, rows = traced, Missing(none=True), "", None
     labels: tuple[tuple[str, str], ...] = ()
     if data is not None:
         experiments = bind(traced, data)
-        missing = missing_of(experiments)
+        known = of_data(traced, experiments)
+        missing = missing_of(experiments, known)
         gaps = sum(int((e.seen == 0).sum()) for e in experiments)
         rows = max(e.steps for e in experiments)
         bound = ", ".join(f"{e.steps} rows" for e in experiments)
         bound += f", {gaps} missing" if gaps else ", none missing"
         labels = _labels(traced, experiments) + _unread([*unread(traced, data)], experiments)
-    program = compile_trace(traced, missing)
+        traced = known
+    program = compile_trace(bare, missing)
     nonlinear = isinstance(exact_model(traced), NotApplicable)
     return Plan(
         traced,

@@ -11,6 +11,7 @@ made.
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import Any, ClassVar
 
 import numpy as np
@@ -85,11 +86,13 @@ def _check_numbers(law: Distribution, name: str, m: ExprArray) -> None:
             numbers = numbers[np.ix_(noisy, noisy)]
     lower = name == "cholesky"
     symmetric = lower or np.allclose(numbers, numbers.T, rtol=1e-10, atol=0)
-    positive = (
-        bool(np.all(np.diagonal(numbers) > 0))
-        if lower
-        else symmetric and bool(np.all(np.linalg.eigvalsh(numbers) > 0))
-    )
+    if lower:
+        positive = bool(np.all(np.diagonal(numbers) > 0))
+    else:
+        least = np.linalg.eigvalsh(numbers)[0] if symmetric else -1.0
+        # a singular one too, q G G', which states may have; see `covariances.py`
+        rounding = ROUNDING * np.abs(numbers).max() if name == "covariance" else 0.0
+        positive = bool(least > -rounding)
     if not symmetric or not positive:
         what = "positive definite" if symmetric else "symmetric"
         raise ModelError(
@@ -241,6 +244,8 @@ class MvNormal(Centred):
         return array(np.diagonal(self.whole_matrix().view(np.ndarray)))
 
     def log_densities(self, value):
+        if self.spread == "covariance" and singular_numbers(self.parameters["covariance"]):
+            return array(constant(-math.inf))  # there is no density
         square, volume = self._square_and_volume(array(value) - self.mean_)
         return array(self.of_form(square, volume, len(self.mean_)))
 
@@ -259,11 +264,24 @@ class MvNormal(Centred):
         return array(self.mean_ + self.factor() @ z)
 
 
-def where_definite(m: ExprArray, density: Expr) -> Expr:
+def where_definite(m: ExprArray, density: Expr, singular: bool = False) -> Expr:
     """A density in which the matrix m stands, and -inf where m is not positive definite: its
-    determinant may be positive all the same."""
-    last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
-    return array(ew("where", ew("lt", 0.0, last), density, -math.inf))[()]
+    determinant may be positive all the same.
+
+    singular : whether m may be singular, as in the density of a sum.
+    """
+    pivots = np.diagonal(cholesky(m).view(np.ndarray))  # 0 where m is singular, nan where negative
+    least = "le" if singular else "lt"
+    definite = reduce(lambda a, b: ew("and", a, b), [ew(least, 0.0, p) for p in pivots])
+    return array(ew("where", definite, density, -math.inf))[()]
+
+
+def singular_numbers(m: ExprArray) -> bool:
+    """Whether a matrix is one of numbers whose rank is less than its size."""
+    if any(e.op != "const" for e in m.ravel()):
+        return False
+    numbers = np.array([e.data for e in m.ravel()]).reshape(m.shape)
+    return bool(np.linalg.matrix_rank(numbers, hermitian=True) < len(numbers))
 
 
 def surely_positive(m: ExprArray) -> bool:

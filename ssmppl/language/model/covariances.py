@@ -21,11 +21,12 @@ import numpy as np
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, constant
+from ssmppl.expressions.properties import may_vanish_by_data
 from ssmppl.expressions.test_points import PLAIN, TestPoints, moderate, numbers_at, wide, with_cases
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.distributions.continuous import Normal
 from ssmppl.language.distributions.discrete import Dirac
-from ssmppl.language.distributions.multivariate import MvNormal
+from ssmppl.language.distributions.multivariate import MvNormal, singular_numbers
 from ssmppl.language.model.trace import Site, Trace
 
 ZERO = 1e-10  # of the variances: what is zero in floating point
@@ -56,6 +57,17 @@ def noiseless(law: Distribution) -> tuple[int, ...]:
         return ()
     matrix, zero = law.parameters["covariance"].view(np.ndarray), constant(0.0)
     return tuple(i for i, row in enumerate(matrix) if all(e is zero for e in row))
+
+
+def without_density(law: Distribution) -> MvNormal | None:
+    """The MvNormal distribution, this one or one inside of it, whose covariance is singular
+    whatever the values of its symbols are; None where there is none."""
+    for inner in law.inside():
+        if (found := without_density(inner)) is not None:
+            return found
+    if not isinstance(law, MvNormal) or law.spread != "covariance":
+        return None
+    return law if noiseless(law) or singular_numbers(law.parameters["covariance"]) else None
 
 
 def by_noise(site: Site) -> list[Site]:
@@ -167,7 +179,8 @@ def _singular_root(matrix: ExprArray) -> ExprArray | None:
         for i in range(k, n):
             if not small[:, i - k].all():
                 own = pivot if i == k else left[i, k] / pivot
-                if gone.any():  # a noise that is there in some cases only
+                if gone.any() or may_vanish_by_data([left[k, k]]):
+                    # a noise that is there in some cases, or in some rows of the data only
                     own = ew("where", ew("lt", ZERO * matrix[k, k], left[k, k]), own, 0.0)
                 root[i, k] = own
         for i in range(k + 1, n):

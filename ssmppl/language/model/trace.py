@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ssmppl.compiling import LOCK
-from ssmppl.errors import Location
+from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.language.distributions import Distribution
@@ -89,6 +89,8 @@ class Trace:
     experiments : labels of the experiments that these have values for, along their first axis; ()
         where there is a single one, and then they are parameters as others. The input
         `EXPERIMENT_NUMBER`, from 0, tells which one a row is of.
+    singular_row, noiseless_row : of a trace bound to data, the first row of these in which the
+        states have no density, and in which an observation has none.
     """
 
     name: str
@@ -107,6 +109,8 @@ class Trace:
     component_names: ComponentNames = field(default_factory=ComponentNames)
     per_experiment: tuple[str, ...] = ()
     experiments: tuple[Any, ...] = ()
+    singular_row: NotApplicable | None = None
+    noiseless_row: NotApplicable | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Packed once, and one object in each process that gets it: what was generated for it is

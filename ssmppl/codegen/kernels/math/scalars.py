@@ -16,6 +16,7 @@ from ssmppl.codegen.kernels.math.flags import exact, precise
 from ssmppl.codegen.kernels.math.special import beta_tails, betainc, gammainc, gammaincc
 
 LARGEST_COUNT = 2.0**53
+PIVOT = 1e-13  # of a variance, below which what is left of it is taken for rounding
 
 
 @precise
@@ -211,16 +212,26 @@ def _matrix(entries, n):
 
 @exact
 def cholesky(entries, n):
-    """Lower Cholesky factor; nan from the first pivot on that is not positive."""
+    """Lower Cholesky factor of a matrix that may be singular.
+
+    A pivot of zero, but for rounding, leaves a column of zeros (Higham 2002, "Accuracy and
+    stability of numerical algorithms", section 10.3); nan from the first pivot on that is negative,
+    or zero beside an entry that is not.
+    """
     a = _matrix(entries, n)
     for j in range(n):
+        least = PIVOT * a[j, j]
         for k in range(j):
             a[j, j] -= a[j, k] * a[j, k]
-        a[j, j] = math.sqrt(a[j, j]) if a[j, j] > 0.0 else math.nan
+        gone = (a[j, j] <= 0.0) & (a[j, j] >= -least)
         for i in range(j + 1, n):
             for k in range(j):
                 a[i, j] -= a[i, k] * a[j, k]
-            a[i, j] /= a[j, j]
+            gone = gone & (a[i, j] * a[i, j] <= least * a[i, i])
+        a[j, j] = math.sqrt(a[j, j]) if a[j, j] > 0.0 else math.nan
+        for i in range(j + 1, n):
+            a[i, j] = 0.0 if gone else a[i, j] / a[j, j]
+        a[j, j] = 0.0 if gone else a[j, j]
     return a
 
 
