@@ -168,13 +168,13 @@ def affine_observation(
     """
     known = dict(following or {})
     for site in sites:
-        if not isinstance(site.distribution, (Normal, MvNormal)):
+        if not isinstance(site.distribution, (Normal, MvNormal, Dirac)):
             kind = type(site.distribution).__name__
             return NotApplicable(f"{site.name} is {kind}", site.distribution.location)
         reason = _not_affine(site, "observation", states, known)
         if reason is not None:
             return reason
-    block = gaussian_block(sites)
+    block = gaussian_block(sites, dirac=True)
     form = affine(substitute(list(block.mean), known), states)
     if isinstance(form, NotApplicable):
         return form
@@ -193,7 +193,7 @@ def _not_affine(
     form = affine(substitute(list(array(d.mean()).ravel()), known or {}), states)
     if isinstance(form, NotApplicable):
         return NotApplicable(f"the mean of the {role} of {site.name}: {form.reason}", d.location)
-    spread = substitute(list(gaussian_block([site]).covariance.ravel()), known or {})
+    spread = substitute(list(gaussian_block([site], dirac=True).covariance.ravel()), known or {})
     if any(depends_on(e, states) for e in spread):
         reason = f"the spread of the {role} of {site.name} depends on the state"
         return NotApplicable(reason, d.location)
@@ -297,9 +297,16 @@ def _gaussian_law(
 
 
 def singular_covariance(trace: Trace) -> NotApplicable | None:
+    """Why states and observations have no joint density beside Dirac components of the states: as
+    of `singular_states`, or an observation without noise."""
+    singular = singular_states(trace)
+    return exact_observation(trace) if singular is None else singular
+
+
+def singular_states(trace: Trace) -> NotApplicable | None:
     """Why the states have no joint density beside their Dirac components: a covariance that is
     singular whatever the parameters are, in some cases of the conditions in it, or in some row of
-    the data; or why they have none with the observations: one without noise in some row."""
+    the data."""
     for role, sites in (("initial distribution", trace.initial), ("transition", trace.transition)):
         for site in sites.values():
             root = site.distribution.root if isinstance(site.distribution, MvNormal) else None
@@ -316,7 +323,7 @@ def singular_covariance(trace: Trace) -> NotApplicable | None:
                     "that its density does not exist",
                     site.distribution.location,
                 )
-    return trace.noiseless_row if trace.singular_row is None else trace.singular_row
+    return trace.singular_row
 
 
 @once_per_trace
@@ -331,6 +338,40 @@ def simulators(trace: Trace) -> tuple[Any, ...]:
 def flat_start(trace: Trace) -> list[Site]:
     """The states that have no proper initial distribution."""
     return [s for s in trace.initial.values() if isinstance(s.distribution, Flat)]
+
+
+def exact_observation(trace: Trace) -> NotApplicable | None:
+    """Why an observation has no density: it is Dirac, or without noise in some row of the data;
+    None where each has noise."""
+    for site in trace.observations.values():
+        if isinstance(site.distribution, Dirac):
+            return NotApplicable(
+                f"{site.name} is observed without noise, so that it has no density given the "
+                "states",
+                site.distribution.location,
+            )
+    return trace.noiseless_row
+
+
+def check_observations(trace: Trace) -> None:
+    """Refuse observations without noise but where they are affine in the states: then there are
+    exact filters, or proposals that condition on them in closed form.
+
+    Raises
+    ------
+    ModelError : naming the observation, the line, and why it is not affine.
+    """
+    exact = exact_observation(trace)
+    if exact is None:
+        return
+    form = affine_observation(list(trace.observations.values()), trace.state_symbols)
+    if isinstance(form, NotApplicable):
+        raise ModelError(
+            f"{exact.reason}: data would have likelihood zero. Observations without noise have to "
+            f"be affine in the states, with Gaussian ones beside them, and here {form.reason}",
+            fix="give the channel a noise, for example ssm.Normal(value, sd=...)",
+            where=exact.where,
+        )
 
 
 def check_start(trace: Trace) -> None:

@@ -18,7 +18,7 @@ from functools import partial
 from ssmppl.analysis.conjugacy import describe
 from ssmppl.analysis.conjugacy.describe import Explanation, MatrixWording, Wording, joined, named
 from ssmppl.analysis.conjugacy.family import Family
-from ssmppl.analysis.conjugacy.numerical_check import verify
+from ssmppl.analysis.conjugacy.numerical_check import Attempts, verify
 from ssmppl.analysis.conjugacy.search import Found, Search, block_kind
 from ssmppl.analysis.conjugacy.separation import (
     BOUNDED_ROLES,
@@ -49,11 +49,12 @@ def derive_updates(
     data = complete_data(trace, missing)
     search = Search(data, frozenset(fixed))
     updates: list[Update] = []
+    attempts = Attempts(data)
     waiting = [(unit, found, False) for unit, found in search.found()]
     while waiting:
         unit, found, refused = waiting.pop(0)
         update = _update(search, unit, found, refused)
-        failure = verify(data, update) if check and update.functions else None
+        failure = verify(data, update, attempts) if check and update.functions else None
         if failure is None:
             updates.append(update)
         elif unit in search.single:

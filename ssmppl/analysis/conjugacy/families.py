@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,7 +91,7 @@ class Gamma(Family):
         suffix = {1.0: "", 2.0: " of the square"}.get(size, f" of the power {size:g}")
         return law + suffix
 
-    @property
+    @cached_property
     def used(self) -> frozenset[int]:
         return held({self.log, self.pow})
 
@@ -188,7 +189,7 @@ class Normal(Family):
     def name(self) -> str:
         return "Normal" if len(self.linear) == 1 else "joint Normal"
 
-    @property
+    @cached_property
     def used(self) -> frozenset[int]:
         return held({*self.linear, *(i for row in self.quadratic for i in row)})
 
@@ -346,7 +347,7 @@ class NormalGamma(ScaledFamily):
         inverse = "inverse-" if self.power < 0 else ""
         return f"Normal-{inverse}Gamma"
 
-    @property
+    @cached_property
     def used(self) -> frozenset[int]:
         return self.normal.used | held({self.log, self.pow})
 
@@ -471,7 +472,7 @@ class Beta(Family):
         enough = complement >= 0 or (log >= 0 and not _powers(form, p))
         return [cls(log, complement)] if enough else []
 
-    @property
+    @cached_property
     def used(self) -> frozenset[int]:
         return held({self.first, self.second})
 
@@ -534,7 +535,7 @@ class Dirichlet(Family):
     def match(cls, components: Sequence[Expr], form: BlockForm, positive: bool) -> list[Dirichlet]:
         return [cls(tuple(place_of_log(form, p) for p in components))]
 
-    @property
+    @cached_property
     def used(self) -> frozenset[int]:
         return held(self.logs)
 

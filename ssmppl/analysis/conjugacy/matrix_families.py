@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -72,7 +73,7 @@ class Wishart(Family):
     def name(self) -> str:
         return "inverse Wishart" if self.inverse else "Wishart"
 
-    @property
+    @cached_property
     def used(self) -> frozenset[int]:
         return held({self.log, *self.entries})
 
@@ -197,7 +198,7 @@ class MatrixNormalWishart(ScaledFamily):
     def name(self) -> str:
         return f"matrix Normal-{'inverse-' if self.wishart.inverse else ''}Wishart"
 
-    @property
+    @cached_property
     def used(self) -> frozenset[int]:
         return self.members
 

@@ -13,7 +13,7 @@ update.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -39,14 +39,32 @@ _HINT = ": roots and logarithms of products are split as if each factor were pos
 Point = dict[Expr, np.ndarray]
 
 
-def verify(data: CompleteData, update: Update, seed: int = 1) -> NotApplicable | None:
-    """None where the update agrees with the model at every point tried, else the reason."""
-    rng = np.random.default_rng(seed)
+class Attempts:
+    """Random rows and other parameters that updates are checked at, drawn once for all of them."""
+
+    def __init__(self, data: CompleteData, seed: int = 1):
+        self.data = data
+        self._rng = np.random.default_rng(seed)
+        self._drawn: list[tuple[list[Point], Point]] = []
+
+    def __iter__(self) -> Iterator[tuple[list[Point], Point]]:
+        for k in range(_ATTEMPTS):
+            if k == len(self._drawn):
+                series = random_series(self.data, self._rng, wide=True)
+                self._drawn.append((series, random_parameters(self.data, self._rng, wide=True)))
+            yield self._drawn[k]
+
+
+def verify(
+    data: CompleteData, update: Update, attempts: Attempts | None = None
+) -> NotApplicable | None:
+    """None where the update agrees with the model at every point tried, else the reason.
+
+    attempts : those of other updates of the model.
+    """
     compared = 0
     names = ", ".join(update.block)
-    for _ in range(_ATTEMPTS):
-        series = random_series(data, rng, wide=True)
-        other = random_parameters(data, rng, wide=True)
+    for series, other in attempts or Attempts(data):
         changed = {c: other[c] for c in update.components}
         first = joint(data, update, series)
         second = joint(data, update, [{**values, **changed} for values in series])

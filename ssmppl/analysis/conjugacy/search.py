@@ -252,8 +252,11 @@ class Search:
         self, law: type[ScaledFamily], block: tuple[Expr, ...], taken: set[Expr]
     ) -> Found | None:
         """The block together with the first unit that scales its precision."""
+        met = frozenset().union(*(term.symbols for term in self.data.holding(block)))
         for unit, found in self.single.items():
             if not isinstance(found, Found) or not isinstance(found.family, law.scale):
+                continue
+            if met.isdisjoint(unit):  # in no term together
                 continue
             whole = (*block, *unit)
             if not (taken | set(block)).isdisjoint(unit) or not self._independent(whole):

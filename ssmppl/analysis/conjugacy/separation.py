@@ -121,11 +121,23 @@ def complete_data(trace: Trace, missing: Missing = NOTHING_MISSING) -> CompleteD
                 found += _terms_of(role, site)
             restrictions += _restrictions(role, site)
     for term in terms(trace, "observation", missing, guard=False):
-        density = term.guarded()
-        found.append(
-            JointTerm("observation", term.site.name, density, term.where, symbols_of(density))
-        )
+        for density in _summands(term.guarded()):  # of each channel: a parameter is in few
+            found.append(
+                JointTerm("observation", term.site.name, density, term.where, symbols_of(density))
+            )
     return CompleteData(trace, tuple(found), tuple(restrictions))
+
+
+def _summands(density: Expr) -> list[Expr]:
+    """What a density is the sum of, as it was written."""
+    found, waiting = list[Expr](), [density]
+    while waiting:
+        node = waiting.pop()
+        if node.op == "add":
+            waiting += reversed(node.args)
+        else:
+            found.append(node)
+    return found
 
 
 def _terms_of(role: str, site: Site) -> list[JointTerm]:

@@ -101,7 +101,7 @@ def _nonlinear(trace: Trace) -> dict[Expr, NotApplicable]:
     for site, states in _laws(trace):
         d = site.distribution
         if gaussian(site):
-            spread = list(gaussian_block([site]).covariance.ravel())
+            spread = list(gaussian_block([site], dirac=True).covariance.ravel())
             means = list(array(d.mean()).ravel())
         else:
             spread, means = [p for a in d.parameters.values() for p in a.ravel()], []
@@ -183,7 +183,7 @@ def _coupled(trace: Trace, linear: set[Expr]) -> set[Expr]:
 
 def correlated(sites: Iterable[Site], seeds: Iterable[Expr]) -> set[Expr]:
     """The components beside `seeds` whose noise is correlated with theirs, or with such ones."""
-    blocks = [gaussian_block([site]) for site in sites]
+    blocks = [gaussian_block([site], dirac=True) for site in sites]
     found, more = set(seeds), True
     while more:
         size = len(found)

@@ -284,7 +284,7 @@ def _affine(site: Site, z: Sequence[Expr]) -> tuple[np.ndarray, np.ndarray, np.n
     return (
         form[0].view(np.ndarray),
         form[1].view(np.ndarray),
-        gaussian_block([site]).covariance.view(np.ndarray),
+        gaussian_block([site], dirac=True).covariance.view(np.ndarray),
     )
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.twisted import LookaheadModel, NoiseForm, lookahead_model
+from ssmppl.analysis.structure import exact_observation
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.calculus import (
     NotDifferentiable,
@@ -66,6 +67,9 @@ def bends(found: LookaheadModel, trace: Trace) -> tuple[Bend, Bend] | NotApplica
 
 def laplace_obstacle(trace: Trace, missing: Missing) -> NotApplicable | None:
     """Why a model has no Laplace approximation of its states; None where it has."""
+    exact = exact_observation(trace)
+    if exact is not None:
+        return exact
     found = lookahead_model(trace, missing)
     if isinstance(found, NotApplicable):
         return found

@@ -29,7 +29,7 @@ from ssmppl.analysis.structure import (
     affine_observation,
     flat_start,
     gaussian_block,
-    singular_covariance,
+    singular_states,
 )
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import (
@@ -54,12 +54,18 @@ from ssmppl.expressions.expr import (
 from ssmppl.expressions.properties import may_vanish_by_data
 from ssmppl.language.distributions import Draws
 from ssmppl.language.distributions.continuous import LOG_2PI
-from ssmppl.language.distributions.multivariate import surely_positive, where_definite
+from ssmppl.language.distributions.multivariate import (
+    singular_numbers,
+    surely_positive,
+    where_definite,
+)
 from ssmppl.language.model.trace import Site, Trace, seen
 
 NEWTON_STEPS = 3
 LONGEST_STEP = 2.0  # in standard deviations of the transition
 DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
+# Of what is written out, entries times the terms of each; 1,000 compile in half a second.
+MOST_TERMS = 8_000
 LARGEST_EXPONENT = 600.0  # of q / f where exp is taken
 
 
@@ -97,7 +103,7 @@ def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable
     if trace.proposal:
         found["user"] = _user(trace, missing)
     guided = _locally_optimal(trace, missing)
-    if isinstance(guided, NotApplicable):
+    if isinstance(guided, NotApplicable) and not isinstance(guided, TooLarge):
         affine_reason = guided
         guided = _laplace(trace, missing)
         if isinstance(guided, NotApplicable):
@@ -241,6 +247,27 @@ def _random(e: Expr) -> bool:
     return any(n.op == "random" for n in topological([e]))
 
 
+class TooLarge(NotApplicable):
+    """Derived, but not written out."""
+
+
+def _channels(trace: Trace) -> int:
+    return sum(len(site.components) for site in trace.observations.values())
+
+
+def _too_large(trace: Trace, *sizes: int) -> TooLarge | None:
+    """Why a proposal is not written out, whose terms are as many as these sizes and the states
+    multiply to."""
+    states, channels = len(trace.state_symbols), _channels(trace)
+    if math.prod(sizes) * states <= MOST_TERMS:
+        return None
+    return TooLarge(
+        f"with {channels} observed components and {states} states, its conditional distributions "
+        "would fill a program that takes minutes to compile",
+        next(iter(trace.observations.values())).distribution.location,
+    )
+
+
 # -- tier 2: locally optimal
 
 
@@ -248,7 +275,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     sites = list(trace.observations.values())
     if not sites:
         return NotApplicable("there is no observation")
-    singular = singular_covariance(trace)
+    singular = singular_states(trace)
     if singular is not None:
         return singular
     transition = split(trace, list(trace.transition.values()))
@@ -258,6 +285,9 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     observation = affine_observation(sites, transition.gaussian.symbols, transition.following)
     if isinstance(observation, NotApplicable):
         return observation
+    large = _too_large(trace, _channels(trace), _channels(trace))
+    if large is not None:
+        return large
     if all(e.op == "const" and e.data == 0.0 for e in observation.matrix.ravel()):
         return NotApplicable(
             "the observation does not depend on the states with a Gaussian transition",
@@ -336,8 +366,11 @@ def _condition(
     predictive = -0.5 * (count * LOG_2PI + log_determinant(s) + residual @ inverse(s) @ residual)
     mean = block.mean + gain @ residual
     if n == 1:
-        information = 1.0 / q[0, 0] + (array(h.T @ inverse(r) @ h))[0, 0]
-        x = mean[0] + apply("sqrt", 1.0 / information) * draws.normal()
+        if singular_numbers(r):
+            left = apply("maximum", 0.0, q[0, 0] - (array(gain @ h) @ q)[0, 0])
+        else:
+            left = 1.0 / (1.0 / q[0, 0] + (array(h.T @ inverse(r) @ h))[0, 0])
+        x = mean[0] + apply("sqrt", left) * draws.normal()
         return {block.symbols[0]: x}, predictive
     # Matheron's rule: a joint draw (x*, e*) from the prior, corrected by the gain. No posterior
     # covariance is factorised, so a nearly singular one is no trouble.
@@ -356,13 +389,16 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     sites = list(trace.observations.values())
     if not sites:
         return NotApplicable("there is no observation")
+    large = _too_large(trace, len(trace.state_symbols), _channels(trace))
+    if large is not None:
+        return large
     observed = terms(trace, "observation", missing)
     # the density without the guards of its support: these depend on y alone or end the particle
     smooth = terms(trace, "observation", missing, guard=False)
     total = constant(0.0)
     for t in smooth:
         total = total + t.guarded()
-    singular = singular_covariance(trace)
+    singular = singular_states(trace)
     if singular is not None:
         return singular
     transition = split(trace, list(trace.transition.values()))

@@ -6,7 +6,7 @@ random numbers are held fixed.
 
 from __future__ import annotations
 
-from ssmppl.analysis.structure import deterministic
+from ssmppl.analysis.structure import deterministic, exact_observation
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import jumps
@@ -18,8 +18,9 @@ from ssmppl.language.model.trace import Trace
 
 def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
     """None where the continuous filter applies, else the reason why not."""
-    if trace.noiseless_row is not None:
-        return trace.noiseless_row
+    exact = exact_observation(trace)
+    if exact is not None:
+        return exact
     if len(trace.state_symbols) != 1:
         return NotApplicable(
             f"the state has {len(trace.state_symbols)} components, and only one can be sorted"

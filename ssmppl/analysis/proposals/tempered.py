@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.structure import deterministic, flat_start, singular_covariance
+from ssmppl.analysis.structure import deterministic, flat_start, singular_states
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, depends_on, symbols_of
@@ -40,7 +40,7 @@ def tempered(trace: Trace, missing: Missing) -> Tempered | NotApplicable:
     if flat:
         where = flat[0].distribution.location
         return NotApplicable(f"the initial distribution of {flat[0].name!r} is Flat", where)
-    singular = singular_covariance(trace)
+    singular = singular_states(trace)
     if singular is not None:
         return singular
     states = trace.state_symbols

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,7 +19,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap, derive
 from ssmppl.analysis.proposals.twisted import twisted
 from ssmppl.analysis.proposals.upper_bounds import transition_upper_bound
-from ssmppl.analysis.structure import check_start
+from ssmppl.analysis.structure import check_observations, check_start, exact_observation
 from ssmppl.codegen.kernels.particle.backward import (
     backward_exact,
     backward_mcmc,
@@ -63,6 +63,37 @@ from ssmppl.language.model.trace import Trace
 OWN_MODULES = {"twisted": "twisted", **dict.fromkeys(MARGINAL, "marginal"), "tempered": "tempered"}
 
 
+class Proposals(Mapping[str, Proposal | NotApplicable]):
+    """What was derived under each name, or why nothing was.
+
+    twisted : derives the proposal of that name when it is first asked for, as second derivatives of
+        many channels in many states take longer than all else.
+    """
+
+    def __init__(
+        self,
+        derived: Mapping[str, Proposal | NotApplicable],
+        twisted: Callable[[], Proposal | NotApplicable],
+    ):
+        self._derived, self._twisted = dict(derived), twisted
+
+    def __getitem__(self, name: str) -> Proposal | NotApplicable:
+        if name == "twisted" and name not in self._derived:
+            with LOCK:
+                if name not in self._derived:
+                    self._derived[name] = self._twisted()
+        return self._derived[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name == "twisted" or name in self._derived
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*(n for n in self._derived if n != "twisted"), "twisted")))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
 @dataclass
 class Program:
     """The generated module of a traced model.
@@ -74,7 +105,7 @@ class Program:
 
     trace: Trace
     missing: Missing
-    proposals: dict[str, Proposal | NotApplicable]
+    proposals: Mapping[str, Proposal | NotApplicable]
     text: str
     module: ModuleType = field(repr=False)
     loaded: Loaded = field(repr=False)
@@ -184,8 +215,11 @@ class Program:
                 if not isinstance(own, NotApplicable):
                     return own.entry(name.removesuffix(f"_{proposal}"), proposal)
         if not hasattr(self.module, name):
-            for proposal, found in self.proposals.items():
-                if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
+            for proposal in self.proposals:
+                if not name.endswith("_" + proposal):
+                    continue
+                found = self.proposals[proposal]
+                if isinstance(found, NotApplicable):
                     raise ArgumentError(
                         f"particles cannot move by the proposal {proposal!r}: {found}",
                         fix="use an exact method, or another proposal",
@@ -220,10 +254,16 @@ def compile_trace(trace: Trace, missing: Missing = Missing()) -> Program:
 
 def _compiled(trace: Trace, missing: Missing) -> Program:
     check_start(trace)
-    proposals = {**derive(trace, missing), "twisted": twisted(trace, missing)}
-    out, lines = _write(trace, missing, proposals)
+    check_observations(trace)
+    if missing.noise is None:
+        missing = replace(missing, noise=exact_observation(trace))
+    derived = derive(trace, missing)
+    out, lines = _write(trace, missing, derived)
     loaded = load(out, identifier(trace.name), lines)
-    proposals = {n: _with_densities(p, missing) for n, p in proposals.items()}
+    proposals = Proposals(
+        {n: _with_densities(p, missing) for n, p in derived.items()},
+        lambda: _with_densities(twisted(trace, missing), missing),
+    )
     return Program(trace, missing, proposals, out.finish(lines), loaded.module, loaded)
 
 
@@ -255,7 +295,7 @@ def _write(
     out.algorithm(simulate_on, "simulate_on", simulation, "entry")
     out.algorithm(observe_states, "observe_states", simulation, "entry")
     for name, proposal in proposals.items():
-        if isinstance(proposal, NotApplicable) or not trace.observations or name in OWN_MODULES:
+        if isinstance(proposal, NotApplicable) or not trace.observations:
             continue
         section = filter_functions(layout, proposal)
         conditional_passes(trace, layout, section, plain)
@@ -298,6 +338,7 @@ def _introduction(trace: Trace, proposals: dict[str, Proposal | NotApplicable]) 
     for name, p in proposals.items():
         what = p.explanation if not isinstance(p, NotApplicable) else f"not derived: {p.reason}"
         lines.append(f"{name:<12} {what}")
+    lines.append(f"{'twisted':<12} where it can be derived: in a module of its own")
     rows = [("theta", trace.parameter_symbols), ("states", trace.state_symbols),
             ("y, seen", trace.observation_symbols), ("u", trace.input_symbols)]  # fmt: skip
     lines.append("")

@@ -45,9 +45,11 @@ from ssmppl.inference.preparation.exact_models import (
     filter_of,
     log_increments,
 )
-from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode, without_climb
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.draws import Block
+
+MANY = 20  # numbers beyond which no mode is looked for, as their closed forms find it sooner
 
 
 @dataclass(frozen=True)
@@ -81,16 +83,16 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
     problem, space = setup.problem, setup.space
     model = needed_model(problem, "Gibbs")
     need_density(problem.trace, "Gibbs", "sample")
-    kind = filter_of(model)
+    kind, updates = filter_of(model), plan_updates(problem, setup.fixed)
     if space.positions.size:
-        pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
+        drawn = all(u.family is not None for u in updates)
+        find = without_climb if drawn and len(space.positions) > MANY else find_mode
+        pilot = setup.once("pilot", lambda: find(space, setup.root, kind))
         check_mode(model, problem.experiments, space.parameters(pilot.z)[0])
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     interweaving, interweaved = prepare_interweaving(setup, method.interweave, pilot, model)
-    steps = GibbsSweeper(
-        problem, plan_updates(problem, setup.fixed), interweaving, method.log_likelihood
-    )
+    steps = GibbsSweeper(problem, updates, interweaving, method.log_likelihood)
     starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []
     for chain, z in enumerate(starts):

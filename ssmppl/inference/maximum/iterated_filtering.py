@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.proposals.perturbed import Perturbed, perturbed
+from ssmppl.analysis.structure import exact_observation
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_iterated_filter
 from ssmppl.compiling import once_property
@@ -243,6 +244,13 @@ def climb(setup: Maximization, method: IF2) -> Ascent:
         distribution.
     SamplingError : the likelihood cannot be evaluated where any of the runs ended.
     """
+    exact = exact_observation(setup.problem.trace)
+    if exact is not None:
+        raise ArgumentError(
+            f"IF2 weighs particles by the density of the observation, and {exact.reason}",
+            fix="use ssm.sample, or give the observation some noise",
+            where=exact.where,
+        )
     setup.problem.proposal("bootstrap")
     check_points(method, len(setup.space.positions))
     model = perturbed_model(setup.space, setup.with_prior)

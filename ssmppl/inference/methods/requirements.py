@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ssmppl.analysis.structure import linear_gaussian, singular_covariance
+from ssmppl.analysis.structure import exact_observation, linear_gaussian, singular_covariance
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.language.model.trace import Trace
 
@@ -25,9 +25,9 @@ def need_density(trace: Trace, method: str, verb: str) -> None:
     if reason is None:
         return
     linear = not isinstance(linear_gaussian(trace), NotApplicable)
-    exact = reason is trace.noiseless_row
+    exact = reason == exact_observation(trace)
     written = (
-        "give the observation some noise there"
+        "give the observation some noise"
         if exact
         else "write components that follow without a noise of their own as states of distribution "
         "ssm.Dirac"

@@ -111,12 +111,14 @@ def choose_by_pilot(
         return Choice(filter_of(found), {})
     if isinstance(problem.program.proposals.get("user"), Proposal):
         return Choice("user", {})
-    candidates = {
-        n: p for n, p in problem.program.proposals.items()
-        if isinstance(p, Proposal) and (look_ahead or p.look_ahead is None)
-    }  # fmt: skip
-    twisted = {n: candidates.pop(n) for n in ("twisted",) if n in candidates}
-    last = twisted if whole else {}
+    derived = problem.program.proposals
+    candidates, last = (
+        {
+            n: p for n in names
+            if isinstance(p := derived[n], Proposal) and (look_ahead or p.look_ahead is None)
+        }
+        for names in ([n for n in derived if n != "twisted"], ["twisted"] if whole else [])
+    )  # fmt: skip
     if temper and "guided" not in candidates:
         tempered = problem.program.proposal("tempered")
         last |= {"tempered": tempered} if isinstance(tempered, Proposal) else {}

@@ -12,7 +12,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import Proposal
-from ssmppl.analysis.structure import flat_start
+from ssmppl.analysis.structure import exact_observation, flat_start
 from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
 from ssmppl.codegen.modules.program import OWN_MODULES, Program, compile_trace
 from ssmppl.data import Experiment, bind
@@ -87,7 +87,7 @@ class Problem:
             return 'use proposal="auto" or "bootstrap"'
         return (
             'use proposal="auto", which draws states given the observation where it can; or give '
-            "the observation some noise there"
+            "the observation some noise"
         )
 
     def proposal(self, name: str, integrate: bool = False, others: Sequence[str] = ()) -> Proposal:
@@ -137,7 +137,7 @@ def missing_of(experiments: Sequence[Experiment], known: Trace | None = None) ->
     """
     none = all(bool(np.all(e.seen == 1.0)) for e in experiments)
     partial: frozenset[str] = frozenset()
-    lacking = (None, None) if known is None else (known.noiseless_row, known.singular_row)
+    lacking = (None, None) if known is None else (exact_observation(known), known.singular_row)
     return Missing(none, partial.union(*(e.partial for e in experiments)), *lacking)
 
 

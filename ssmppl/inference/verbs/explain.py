@@ -90,7 +90,7 @@ class Plan:
     structure: LinearGaussian | NotApplicable
     conditional: ConditionallyLinear | NotApplicable
     finite: FiniteStates | NotApplicable
-    proposals: dict[str, Proposal | NotApplicable]
+    proposals: Mapping[str, Proposal | NotApplicable]
     updates: tuple[Update, ...]
     deterministic_memory: int | None
     noises: Noises | NotApplicable

@@ -190,8 +190,9 @@ def _filter(
         )
     if proposal == "auto":
         proposal = choose_by_pilot(
-            setup.problem, setup.theta, exact=False, integrate=integrate
-        ).name
+            setup.problem, setup.theta, exact=False, whole=isinstance(method, FFBSi),
+            integrate=integrate,
+        ).name  # fmt: skip
     n = PARTICLES if setup.particles is None else setup.particles
     settings = resolve_settings(
         setup.problem, setup.theta, n, proposal, method.resampling, method.ess_threshold,

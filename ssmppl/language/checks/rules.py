@@ -141,12 +141,6 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
         )
     if role in ("initial", "transition", "proposal") and not distribution.drawable:
         raise distribution.undrawable(f"{name!r} is a state, which particles draw")
-    if role == "observation" and isinstance(distribution, Dirac):
-        raise ModelError(
-            f"the observation {name!r} is Dirac: data would have likelihood zero",
-            fix="give the channel a noise, for example ssm.Normal(value, sd=...)",
-            where=where,
-        )
     if 0 in distribution.shape:
         raise ModelError(
             f"{name!r} has shape {distribution.shape}, which holds nothing",
