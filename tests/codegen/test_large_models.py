@@ -1,0 +1,76 @@
+"""What is done for a model grows as the model does: counted, not timed.
+
+A factor model with twice the series has twice the loadings; each part of an expression is written
+into a comment once, and each draw of random numbers that updates are checked at is for all of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.analysis.conjugacy import numerical_check, search
+from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.proposals.proposals import derive
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions import expr
+from ssmppl.language.tracing import trace
+
+
+def factors(states: int, series: int) -> ssm.Model:
+    model = ssm.Model(f"factors {states} {series}")
+    model.prior(lambda: {
+        "C": ssm.Normal(np.zeros((series, states)), sd=1),
+        "r": ssm.InverseGamma(np.full(series, 2.0), scale=1),
+    })  # fmt: skip
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(states), sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.8 * x, sd=0.5)})
+    model.observation(lambda x, C, r: {"y": ssm.Normal(C @ x, variance=r)})
+    return model
+
+
+def called(monkeypatch, module, name, run) -> list:
+    """The first argument of each call of a function."""
+    calls, original = [], getattr(module, name)
+
+    def noting(*args, **kwargs):
+        calls.append(args[0])
+        return original(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, name, noting)
+        run()
+    return calls
+
+
+def test_comments(monkeypatch):
+    """Of every section's functions: no part of them is written twice."""
+    model = factors(3, 12)
+    calls = called(monkeypatch, expr, "_written", lambda: ssm.compile(model))
+    assert len(calls) > 1000
+    assert len(calls) < 1.5 * len(set(calls))
+
+
+def test_updates(monkeypatch):
+    points, tried = {}, {}
+    for k in (5, 10):
+        data = trace(factors(2, k))
+        drawn = called(
+            monkeypatch, numerical_check, "random_series", lambda data=data: derive_updates(data)
+        )
+        points[k] = len(drawn)
+        tried[k] = len(
+            called(monkeypatch, search, "separate_block", lambda data=data: derive_updates(data))
+        )
+    assert points[5] == points[10]
+    assert tried[10] <= 2.2 * tried[5]
+
+
+@pytest.mark.parametrize(("states", "series", "written"), [(2, 20, True), (2, 100, False)])
+def test_proposals_of_many_channels_are_not_written_out(states, series, written):
+    found = derive(trace(factors(states, series)), Missing(none=True))
+    assert isinstance(found["guided"], NotApplicable) is not written
+    if not written:
+        assert "100 observed components and 2 states" in found["guided"].reason
