@@ -12,6 +12,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.analysis.conjugacy import numerical_check, search
 from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.analysis.conjugacy.separation import complete_data
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import derive
 from ssmppl.errors import NotApplicable
@@ -64,6 +65,8 @@ def test_updates(monkeypatch):
         tried[k] = len(
             called(monkeypatch, search, "separate_block", lambda data=data: derive_updates(data))
         )
+        terms = complete_data(data).terms
+        assert sum(t.role == "observation" for t in terms) == k  # of each channel
     assert points[5] == points[10]
     assert tried[10] <= 2.2 * tried[5]
 

@@ -49,6 +49,19 @@ def test_a_variance_at_zero_leaves_the_others_their_errors(slope: str, edge: flo
     assert note.startswith(f"the maximum in s is at {edge:g}, the boundary of its parameter space")
 
 
+@pytest.mark.parametrize("start", [1e-60, 1e-200, 3e-296, 1e-310])
+def test_a_variance_that_all_digits_have_left_is_at_zero(start: float):
+    """Also where nothing changes over many powers of ten: it was "at inf", or at no edge, and the
+    others had no errors."""
+    data = {"y": steady()}
+    found = ssm.maximize(trend("variance"), data, seed=1, progress=False, start={"s": start})
+    smaller = ssm.maximize(trend(None), data, seed=1, progress=False)
+    assert found.attrs["converged"]
+    assert found.attrs["held_at_edge"] == {"s": 0.0}
+    for name in ("q", "r"):
+        assert found.standard_errors[name] == pytest.approx(smaller.standard_errors[name], rel=1e-3)
+
+
 def test_em_on_its_way_to_the_edge_has_the_errors_too():
     data = {"y": steady()}
     found = ssm.maximize(trend("variance"), data, ssm.EM(iterations=300), seed=1, progress=False)

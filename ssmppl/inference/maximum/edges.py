@@ -10,6 +10,7 @@ before, which tells it from a parameter that is not identified.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -31,6 +32,7 @@ FARTHEST = (
     8.0,
 )  # the last of them: nothing is left inside, nor is it rounded to nothing
 INWARDS = tuple(np.arange(2.0, 65.0, 2.0).tolist())  # so close that no hill lies between
+WIDER = 6.0  # steps beyond, which begin where the objective is as flat as rounding leaves it
 ROUNDING = 1e-9  # of the objective, relative
 AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb is not finished
 FALL = 0.5  # of the objective inwards: half a unit, as at one standard error of a normal law
@@ -52,16 +54,31 @@ def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.nd
             return -np.inf
 
     loss = ROUNDING * (1.0 + abs(here))
+
+    def falls(j: int, sign: float) -> bool:
+        """Whether the objective falls on this way, and rises nowhere near; looked for as far as
+        the middle, as a spread may have gone to where it counts for nothing."""
+        inwards = [moved(j, sign * s) for s in INWARDS]
+        if max(inwards) > AT_MOST:
+            return False
+        beyond = np.arange(INWARDS[-1] + WIDER, abs(z[j]) + INWARDS[-1], WIDER)
+        before = 0.0
+        for change in itertools.chain(inwards, (moved(j, sign * s) for s in beyond)):
+            if change > AT_MOST:
+                return False
+            if change <= -FALL:  # no number where nothing fell before is an underflow
+                return change > -np.inf or before < -loss
+            before = change
+        return False
+
     for j in range(len(z)):
         for sign in (-1.0, 1.0):
             ends = (moved(j, sign * s) for s in FARTHEST)
             last = next((change for change in ends if change > -np.inf), -np.inf)
             outwards = (last, *(moved(j, sign * s) for s in OUTWARDS))
-            if not all(-loss <= change <= AT_MOST for change in outwards):
-                continue
-            inwards = [moved(j, -sign * s) for s in INWARDS]
-            if max(inwards) <= AT_MOST and not min(inwards) > -FALL:
+            if all(-loss <= change <= AT_MOST for change in outwards) and falls(j, -sign):
                 out[j] = sign
+                break
     return out
 
 
