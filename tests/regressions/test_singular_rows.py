@@ -122,6 +122,28 @@ def test_what_needs_a_density_is_refused_by_row(build, named, method):
     assert "has no density" not in str(ssm.explain(model))
 
 
+def test_proposals_by_newton_steps_are_refused_by_row():
+    """They divide by the covariance of the states; those of the twisted filter do not, and agree
+    with the transition's."""
+    model, inputs = velocity()
+    counts = ssm.Model("counts", inputs=("dt",))
+    counts.initial(lambda: {"x": ssm.MvNormal(np.zeros(2), covariance=np.eye(2))})
+    counts.transition(model.functions["transition"][0])
+    counts.observation(lambda x: {"y": ssm.Poisson(np.exp(1.0 + 0.3 * x[0]))})
+    data = {**inputs, "y": np.array([3.0, 2, 5, 1, 0, 2, 4, 3])}
+    with pytest.raises(ssm.ArgumentError, match=r"row 2 \(dt = 0\)"):
+        ssm.log_likelihood(counts, data, {}, proposal="guided")
+    plain = ssm.log_likelihood(
+        counts, data, {}, proposal="bootstrap", particles=20_000, repeats=50, seed=1
+    )
+    twisted = ssm.log_likelihood(
+        counts, data, {}, proposal="twisted", particles=500, repeats=50, seed=2
+    )
+    apart = np.exp(plain - plain.mean()).mean(), np.exp(twisted - plain.mean()).mean()
+    error = np.hypot(plain.std(), twisted.std()) / np.sqrt(50.0)
+    assert abs(apart[0] - apart[1]) < 4.0 * error
+
+
 def test_rows_without_measurement_are_no_exact_ones():
     model, data, *_ = posed(exact_sensor)
     data["y"] = np.where(data["s"] == 0.0, np.nan, data["y"])

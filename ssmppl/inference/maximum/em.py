@@ -18,6 +18,7 @@ when to stop.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -33,7 +34,7 @@ from ssmppl.analysis.conjugacy.m_step import (
 )
 from ssmppl.analysis.density import terms
 from ssmppl.data import Experiment
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, warn
 from ssmppl.expressions.calculus import gradient as gradient_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
@@ -140,6 +141,7 @@ class FiniteSteps:
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken
 ROUNDING = 1e-13  # of the log-likelihood, relative
+PATIENCE = 20.0  # seconds of all steps, beyond which it is said that they are slow
 CALM = 2  # cycles in a row that have to find the limit near
 
 
@@ -350,7 +352,18 @@ class _Climb:
 
     def _step(self, theta: np.ndarray) -> np.ndarray:
         self.maps += 1
-        return self.map(theta)
+        began = time.perf_counter()
+        found = self.map(theta)
+        each = time.perf_counter() - began
+        if self.maps == 2 and not isinstance(self.map.step, MStep):  # the first may compile
+            whole = each * self.method.iterations
+            if whole > PATIENCE:
+                warn(
+                    f"EM may take {whole:.0f} s for {self.method.iterations} steps: the maximum of "
+                    f"each is climbed to, as it has no closed form ({self.map.step.reason}). "
+                    "ssm.DirectOptimization() climbs the likelihood itself"
+                )
+        return found
 
     def _take(self, theta: np.ndarray, value: float) -> None:
         self.theta, self.value = theta, value
