@@ -141,7 +141,7 @@ class FiniteSteps:
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken
 ROUNDING = 1e-13  # of the log-likelihood, relative
-PATIENCE = 20.0  # seconds of all steps, beyond which it is said that they are slow
+PATIENCE = 60.0  # seconds of all steps, beyond which it is said that they are slow
 CALM = 2  # cycles in a row that have to find the limit near
 
 
@@ -359,8 +359,9 @@ class _Climb:
             whole = each * self.method.iterations
             if whole > PATIENCE:
                 warn(
-                    f"EM may take {whole:.0f} s for {self.method.iterations} steps: the maximum of "
-                    f"each is climbed to, as it has no closed form ({self.map.step.reason}). "
+                    f"EM may take up to {whole:.0f} s, for {self.method.iterations} steps: the "
+                    "maximum of each is climbed to, as it has no closed form "
+                    f"({self.map.step.reason}). "
                     "ssm.DirectOptimization() climbs the likelihood itself"
                 )
         return found

@@ -20,6 +20,7 @@ from ssmppl.data import Experiment, check_parameters, unpack_observations, unpac
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
+from ssmppl.inference.exact.state_values import probabilities
 from ssmppl.inference.gaussian.likelihood import APPROXIMATE, approximation_of
 from ssmppl.inference.gaussian.moments import ApproximateKalman
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, full_run
@@ -423,27 +424,5 @@ def forward_filter(
             exact.quantiles(law, levels), prediction, q,
         )  # fmt: skip
         dataset = filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess")
-        datasets.append(dataset.assign(_probabilities(exact, law, dataset)))
+        datasets.append(dataset.assign(probabilities(exact, law, dataset)))
     return by_experiment(problem.experiments, datasets)
-
-
-def _probabilities(
-    exact: HiddenMarkov, law: np.ndarray, dataset: xr.Dataset
-) -> dict[str, xr.DataArray]:
-    """Probabilities of each state's values, from the distributions (T, K) of their combinations."""
-    import xarray as xr
-
-    out = {}
-    for name, site in exact.trace.transition.items():
-        own = [k for k, s in enumerate(exact.trace.state_symbols) if s.data[1] == name]
-        columns = exact.values[:, own]
-        values, index = np.unique(columns, return_inverse=True)
-        shares = np.eye(len(values))[index.reshape(columns.shape)]  # (K, size, values)
-        chances = np.einsum("tk,kdv->tdv", law, shares).reshape(-1, *site.shape, len(values))
-        if name in exact.trace.auxiliary:
-            chances[0] = np.nan
-        out[f"{name}_probability"] = xr.DataArray(
-            chances[None], dims=(*dataset[name].dims, f"{name}_value"),
-            coords={**dataset[name].coords, f"{name}_value": values},
-        )  # fmt: skip
-    return out

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
+from ssmppl.inference.exact.state_values import probabilities, viterbi_paths
 from ssmppl.inference.gaussian.likelihood import APPROXIMATE, approximation_of
 from ssmppl.inference.gaussian.moments import ApproximateKalman
 from ssmppl.inference.methods.methods import (
@@ -88,13 +89,15 @@ class SmoothedStates:
     """What a method gives for one experiment: draws (M, T, D), or moments; and its report.
 
     moments : mean (T, D), covariance (T, D, D), cross (T, D, D), quantiles (T, P, D).
-    over_time : further variables (T,).
+    over_time : further variables (T,). finite : of states of finitely many values, their
+    probabilities (T, K) by combination, and the most probable path (T, D).
     """
 
     attrs: dict[str, Any]
     paths: np.ndarray | None = None
     moments: tuple[np.ndarray, ...] | None = None
     over_time: Mapping[str, np.ndarray] | None = None
+    finite: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def by_kalman(setup: SmoothingSetup, method: KalmanSmoother) -> list[SmoothedStates]:
@@ -144,7 +147,12 @@ def by_forward_backward(setup: SmoothingSetup, method: ForwardBackward) -> list[
         return _exact_draws(setup, model, [total_of(f.log_increments) for f in filtered])
     smoothed = model.smooth_each(experiments, theta)
     spreads = [model.quantiles(law, setup.levels) for _, law in smoothed]
-    return _exact_moments([m for m, _ in smoothed], spreads)
+    paths = viterbi_paths(model, experiments, theta)
+    found = _exact_moments([m for m, _ in smoothed], spreads)
+    return [
+        replace(one, finite=(law, path), attrs={**one.attrs, "viterbi_log_probability": height})
+        for one, (_, law), (path, height) in zip(found, smoothed, paths, strict=True)
+    ]
 
 
 def _without_particles(setup: SmoothingSetup, method: SmoothingMethod) -> None:
@@ -363,7 +371,10 @@ def smooth(
         Moments, dim `draw` of length 1: as of `kalman_filter`, ``x``, ``x_sd``, ``x_quantile`` and
         ``covariance`` of all stacked components, but given all of the data; and
         ``covariance_previous``, that of x_t (`state`) with x_{t-1} (`state_`), NaN in the first
-        row. For FixedLag also `distinct`, the ancestors that are left.
+        row. Of states of finitely many values also ``x_probability``, P(x_t = value given all of
+        the data), last dim `x_value`, and ``x_viterbi``, the most probable path of all rows and
+        states together, whose log p(x, y) is the attribute `viterbi_log_probability`.
+        For FixedLag also `distinct`, the ancestors that are left.
         Both: the data, ``y_observed`` of channels y and ``u_input`` of inputs u, (time, ...).
         Attributes name method, settings, seed and the log-likelihood (exact, or the filter's
         estimate); `approximate` is 1 where moments, draws and log-likelihood are those of a
@@ -469,6 +480,10 @@ def _dataset(
         for n, v in unpack_states(trace, sd).items():
             variables[f"{n}_sd"] = v
             dims[f"{n}_sd"] = ["time", *component_dims(n, v, 2)]
+        if found.finite is not None:
+            for n, v in unpack_states(trace, found.finite[1][None]).items():
+                variables[f"{n}_viterbi"] = v
+                dims[f"{n}_viterbi"] = ["time", *component_dims(n, v, 2)]
         variables |= {"covariance": covariance, "covariance_previous": cross}
         dims |= {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
         coords["state"] = coords["state_"] = [trace.label(s) for s in trace.state_symbols]
@@ -484,5 +499,9 @@ def _dataset(
         coords={**trace.component_names.coords, **coords}, renamed=trace.component_names.renamed,
         attrs={**attrs, **found.attrs, "observes": observes(trace)},
     )  # fmt: skip
+    if found.finite is not None:
+        model = hidden_markov(trace)
+        assert not isinstance(model, NotApplicable)
+        out = out.assign(probabilities(model, found.finite[0], out))
     out = out.assign({k: ("time", v) for k, v in (found.over_time or {}).items()})
     return with_data(out, trace, experiment)

@@ -10,6 +10,7 @@ from ssmppl.analysis.finite import MOST, finite_states
 from ssmppl.data import bind
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.exact.hidden_markov import hidden_markov
+from ssmppl.inference.exact.state_values import viterbi_paths
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.tracing import trace
 from tests.models.finite import MODELS, data_of, enumerated, independent, weather
@@ -51,6 +52,14 @@ def test_moments_are_those_of_all_paths(case):
     cross = np.einsum("m,mti,mtj->tij", w, away[:, 1:], away[:, :-1])
     np.testing.assert_allclose(found.cross[1:], cross, atol=1e-12)
     assert found.log_likelihood == pytest.approx(logsumexp(log_p), rel=1e-12)
+
+
+def test_the_most_probable_path_is_the_best_of_all(case):
+    _, traced, e, theta, paths, log_p = case
+    ((path, height),) = viterbi_paths(hidden_markov(traced), [e], theta)
+    assert height == pytest.approx(log_p.max(), rel=1e-12)
+    best = {p.tobytes() for p, v in zip(paths, log_p, strict=True) if v > log_p.max() - 1e-9}
+    assert path.tobytes() in best
 
 
 def test_the_filter_knows_no_later_rows(case):

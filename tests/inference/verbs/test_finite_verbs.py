@@ -1,5 +1,7 @@
 """The verbs on models of finitely many states: exact wherever they can be."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -127,6 +129,37 @@ def test_smoothing_is_exact(data):
     assert np.all(off <= stats.norm.isf(LEVEL / 160) * error + 1e-3)
     with pytest.raises(ArgumentError, match="ForwardBackward works without particles"):
         ssm.smooth(weather(), data, VALUES, "forward_backward", particles=10)
+
+
+def test_smoothed_probabilities_and_the_most_probable_path(data):
+    """Of several experiments too; the path's probability against those of drawn paths."""
+    other = {"y": data["y"][:50]}
+    for found, own in zip(ssm.smooth(weather(), [data, other], VALUES), (data, other), strict=True):
+        one = found.isel(draw=0)
+        shares = one["z_probability"]
+        assert shares.sum("z_value").to_numpy() == pytest.approx(np.ones(len(own["y"])))
+        mean = (shares * shares["z_value"]).sum("z_value").to_numpy()
+        assert mean == pytest.approx(one["z"].to_numpy(), abs=1e-12)
+        (e,) = bind(trace(weather()), own)
+        smoothed = hidden_markov(trace(weather())).probabilities(e, np.array([*VALUES.values()]))
+        assert shares.sel(z_value=1).to_numpy() == pytest.approx(smoothed[:, 1], abs=1e-12)
+        path, height = one["z_viterbi"].to_numpy(), found.attrs["viterbi_log_probability"]
+        assert height == pytest.approx(_log_joint(path, own["y"]), abs=1e-9)
+        drawn = ssm.smooth(weather(), own, VALUES, trajectories=200, seed=1)["z"].to_numpy()
+        assert max(_log_joint(x, own["y"]) for x in drawn) <= height + 1e-9
+
+
+def _log_joint(x, y) -> float:
+    """By the model's own density, at fixed parameters."""
+    traced = trace(weather())
+    (e,) = bind(traced, {"y": y})
+    model = hidden_markov(traced)
+    (h,) = model.histories_of([e])
+    tables = model.tables(h, np.array([*VALUES.values()]))
+    index = x.astype(int)
+    move = tables.log_move[0]
+    total = tables.log_start[0, index[0]] + tables.log_g[np.arange(len(x)), index].sum()
+    return float(total + sum(move[a, b] for a, b in itertools.pairwise(index)))
 
 
 def test_the_score_and_the_maximum(data):
