@@ -122,7 +122,7 @@ def _check_symmetry(law: Distribution, name: str, m: ExprArray) -> None:
             raise ModelError(
                 f"{type(law).__name__}: {name} is not symmetric: its entry [{i}, {j}] is "
                 f"{m[i, j]}, and [{j}, {i}] is {m[j, i]}",
-                fix="give both the same value",
+                fix="give both the same value; of a matrix M of an input, (M + M.T) / 2",
                 where=law.location,
             )
 

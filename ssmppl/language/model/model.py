@@ -27,6 +27,7 @@ from ssmppl.language.model.pickling import reduced
 from ssmppl.language.written import Written, written
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
+Length = int | tuple[int, ...] | None  # of an input
 TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}  # in seconds
 _MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python's
 ROLES = ("prior", "initial", "transition", "observation", "proposal")
@@ -57,7 +58,7 @@ class Model:
     ----------
     name : shown in results and messages.
     inputs : names of the measured inputs u_t; a mapping name -> length where some are vectors, with
-        None for a number.
+        None for a number; a tuple of lengths for a matrix, as a covariance that is known by row.
     time_step : name of an input besides that is the time from a row to the next, taken from the
         times of the data's rows (their index, or a column `time`), which may be uneven; a column of
         that name in the data goes before.
@@ -89,7 +90,7 @@ class Model:
     """
 
     def __init__(
-        self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int | None] = (),
+        self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, Length] = (),
         time_step: str | None = None, time_unit: str = "s",
         experiment: str | None = None,
         coords: Mapping[str, Iterable[Any]] | None = None,
@@ -116,12 +117,14 @@ class Model:
             )
         pairs = list(inputs.items() if isinstance(inputs, Mapping) else ((n, None) for n in inputs))
         for key, length in pairs:
-            whole = length is None or (isinstance(length, (int, np.integer)) and length > 0)
+            sizes = () if length is None else length if isinstance(length, tuple) else (length,)
+            whole = all(isinstance(n, (int, np.integer)) and n > 0 for n in sizes)
             if not (isinstance(key, str) and key.isidentifier()) or not whole:
                 raise ModelError(
                     f"input {key!r} of length {length!r}",
                     fix="input names are Python identifiers; the length of a vector input is a "
-                    "positive whole number, None stands for a number",
+                    "positive whole number, that of a matrix a tuple of two, None stands for a "
+                    "number",
                     where=self.location,
                 )
         self.time_step = self._checked_time_step(time_step, time_unit)
@@ -144,7 +147,8 @@ class Model:
         self.component_names = ComponentNames.of(dims, coords, self.location)
         self.name = name
         self.inputs: dict[str, tuple[int, ...]] = {
-            key: () if length is None else (int(length),) for key, length in pairs
+            key: () if length is None else tuple(map(int, np.atleast_1d(length)))
+            for key, length in pairs
         }
         self.functions: dict[str, list[Callable[..., Any]]] = {role: [] for role in ROLES}
         self.per_experiment: set[Callable[..., Any]] = set()  # priors of each experiment's own
@@ -412,7 +416,8 @@ class Model:
                 needs = markup.code(names) if names else markup.text("nothing")
                 rows.append((markup.text(role), needs, markup.text(where.place)))
                 texts.append(_source(function))
-        lengths = [n + (f" ({s[0]} numbers)" if s else "") for n, s in self.inputs.items()]
+        lengths = [n + (f" ({' x '.join(map(str, s))} numbers)" if s else "")
+                   for n, s in self.inputs.items()]  # fmt: skip
         if lengths:
             rows.insert(0, (markup.text("inputs"), markup.code(", ".join(lengths)), ""))
         if not rows:
