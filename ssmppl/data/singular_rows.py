@@ -3,6 +3,7 @@ length, an input that switches a noise off, so that a variance is zero, or a cov
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from ssmppl.language.distributions import LogNormal, MvNormal, Normal
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.model.trace import Site, Trace, previous
 
+CHUNK = 1 << 16  # rows that are looked at together
 OF_A_SCALE = ("sd", "scale")  # of other distributions: zero where all of their draws are the same
 
 
@@ -31,7 +33,12 @@ def of_data(trace: Trace, experiments: Sequence[Experiment]) -> Trace:
     noiseless = next(_of_observations(trace, experiments), None)
     if singular is None and noiseless is None:
         return trace
-    return replace(trace, singular_row=singular, noiseless_row=noiseless)
+    # one object for all data with these rows, as what is derived of a trace is kept by it
+    kept: dict[tuple, Trace] = trace.__dict__.setdefault("_of_data", {})
+    key = singular, noiseless
+    if key not in kept:
+        kept[key] = replace(trace, singular_row=singular, noiseless_row=noiseless)
+    return kept[key]
 
 
 def _of_states(trace: Trace, experiments: Sequence[Experiment]) -> Iterator[NotApplicable]:
@@ -75,12 +82,8 @@ def _of_site(
         read = [s for s in symbols_of(entries) if s in known]
         if not read or not may_vanish_by_data(entries) or not len(known[read[0]]):
             continue
-        values, place = np.unique(
-            np.stack([known[s] for s in read], axis=-1), axis=0, return_inverse=True
-        )
-        singular = _singular(n, entries, dict(zip(read, values.T, strict=True)))[place.ravel()]
-        if singular.any():
-            k = int(np.argmax(singular))
+        k = _first_singular(n, entries, {s: known[s] for s in read})
+        if k is not None:
             here = ", ".join(f"{_column(s)} = {number(float(known[s][k]))}" for s in read)
             row = k if rows is None else int(rows[k])
             where = f"row {row + 1}" + ("" if e.label is None else f" of {e.label!r}")
@@ -112,25 +115,36 @@ def _spreads(law: Distribution) -> Iterator[tuple[int, list[Expr]]]:
                 yield from ((1, [v]) for v in values.ravel())
 
 
-def _singular(n: int, entries: list[Expr], values: dict[Expr, np.ndarray]) -> np.ndarray:
-    """Whether the matrix is singular, for each of the values of what data tell, at every point that
-    it is a covariance at; what is not known stands at points of its own."""
+def _first_singular(n: int, entries: list[Expr], values: dict[Expr, np.ndarray]) -> int | None:
+    """The first of the rows of `values` in which the matrix is singular; None where none is."""
+    rows = len(next(iter(values.values())))
+    for first in range(0, rows, CHUNK):
+        some = {s: v[first : first + CHUNK] for s, v in values.items()}
+        suspect = np.flatnonzero(_singular(n, entries, some, 1))
+        sure = suspect[_singular(n, entries, {s: v[suspect] for s, v in some.items()}, PLAIN)]
+        if len(sure):
+            return first + int(sure[0])
+    return None
+
+
+def _singular(
+    n: int, entries: list[Expr], values: dict[Expr, np.ndarray], points: int
+) -> np.ndarray:
+    """Whether the matrix is singular, for each of the values of what data tell, at each of so many
+    points of all else at which it is a covariance."""
     rng = np.random.default_rng(20)
     rows = len(next(iter(values.values())))
     others = sorted(symbols_of(entries) - set(values), key=to_text)
     at = {s: v[:, None] for s, v in values.items()}
-    at |= {s: rng.uniform(0.2, 0.9, (1, PLAIN)) for s in others}
+    at |= {s: rng.uniform(0.2, 0.9, (1, points)) for s in others}
     with np.errstate(all="ignore"):
         found = np.stack(
-            [np.broadcast_to(v, (rows, PLAIN)) for v in evaluate(entries, at)], axis=-1
-        ).reshape(rows, PLAIN, n, n)
-    try:
+            [np.broadcast_to(v, (rows, points)) for v in evaluate(entries, at)], axis=-1
+        ).reshape(rows, points, n, n)
+    with contextlib.suppress(np.linalg.LinAlgError):
         own = np.diagonal(np.linalg.cholesky(found), axis1=-2, axis2=-1) ** 2
-        own = own > PIVOT * np.diagonal(found, axis1=-2, axis2=-1)
-        if own.all():
+        if np.all(own > PIVOT * np.diagonal(found, axis1=-2, axis2=-1)):
             return np.zeros(rows, dtype=bool)
-    except np.linalg.LinAlgError:
-        pass
     finite = np.isfinite(found).all(axis=(-2, -1))
     found = np.where(finite[..., None, None], found, np.eye(n))
     diagonal = np.diagonal(found, axis1=-2, axis2=-1)
