@@ -90,7 +90,7 @@ def inputs_is_a_number():
     return Model("m", inputs=3)  # HERE
 
 
-@bad("input 'w' of length 0", "positive whole number, None stands for a number")
+@bad("input 'w' of length 0", "positive whole number", "None stands for a number")
 def input_of_no_length():
     return Model("m", inputs={"w": 0})  # HERE
 
@@ -390,14 +390,6 @@ def half_flat_start():
     return declare(initial=initial)
 
 
-@bad("the observation 'y' is Dirac", "give the channel a noise")
-def observation_without_noise():
-    def observation(x):
-        return {"y": ssm.Dirac(x)}  # HERE
-
-    return declare(observation=observation)
-
-
 @bad("@proposal gives no distribution for the state 'v'", "it gives: x")
 def proposal_for_one_state_only():
     def proposal(x):  # HERE
@@ -468,11 +460,19 @@ def shapes_do_not_agree():
 
 
 @bad("covariance is not positive definite", "exactly zero is ssm.Dirac")
-def singular_covariance():
+def indefinite_covariance():
     def initial():
-        return {"x": ssm.MvNormal(np.zeros(2), covariance=np.ones((2, 2)))}  # HERE
+        return {"x": ssm.MvNormal(np.zeros(2), covariance=[[1.0, 2.0], [2.0, 1.0]])}  # HERE
 
     return declare(initial=initial)
+
+
+@bad("the covariance of 'y' in @observation is singular", "only states may be without noise")
+def singular_covariance():
+    def observation(x):
+        return {"y": ssm.MvNormal([x, x], covariance=np.ones((2, 2)))}  # HERE
+
+    return declare(observation=observation)
 
 
 @bad("'1'", "no number or symbol")
