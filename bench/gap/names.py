@@ -38,3 +38,8 @@ ITEMS: dict[str, tuple[str, ...]] = {
     "coloured noise": ("coloured noise",),
     "coarse discretisation": ("coarse discretisation",),
 }
+
+# What describes that something is missing, and names no mechanism; and what changes in time.
+UNKNOWN = {"missing input", "coloured noise", "outliers", "heteroscedastic noise",
+           "parameter random walk"}  # fmt: skip
+CHANGES = {"parameter drift", "parameter break", "level break", "sensor drift"}

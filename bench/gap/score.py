@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.gap.generate import ANSWERS, read_digests
+from bench.gap.names import CHANGES, UNKNOWN
 from bench.gap.plan import SPLIT, entries
 from bench.gap.records import CACHE, Record, parse
 from bench.gap.sealing import digest, unseal
@@ -86,6 +87,16 @@ class Scored:
     @property
     def size(self) -> int:
         return len({effect for effect, _ in self.record.confidence or ()})
+
+    @property
+    def mechanism(self) -> bool:
+        """Whether the truth is one effect of the catalogue, and a mechanism."""
+        return bool(self.names()) and not self.names() & (UNKNOWN | CHANGES)
+
+    @property
+    def unknown_first(self) -> bool:
+        """Whether the answer begins with what names no mechanism."""
+        return bool(self.record.chosen) and self.record.chosen[0][0] in UNKNOWN
 
     @property
     def both(self) -> bool:
@@ -174,6 +185,12 @@ def measures(method: str, scored: Sequence[Scored], fresh: Shares | None = None)
         rate("among the first three", method, (s.among_three for s in ones), ">= 0.95"),
         rate("right equation", method, (s.right_equation for s in ones), ">= 0.90"),
         rate("effect and equation", method, (s.right_first and s.right_equation for s in ones), ""),
+        rate(
+            "an unknown input or a noise law first, of mechanisms",
+            method,
+            (s.unknown_first for s in ones if s.mechanism),
+            "<= 0.05",
+        ),
         rate("confidence set holds the truth", method, (s.held for s in claims), ">= 0.95"),
         median("its size at 50 nats", method, (float(s.size) for s in strong), "<= 2"),
         rate("an effect detected, 20 nats", method, map(detected, of("one-20")), ""),
