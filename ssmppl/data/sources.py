@@ -325,8 +325,9 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
                 f"the {name} {label_text(labels[row])} stands in rows {first[value] + 1} "
                 f"and {row + 1}",
                 fix="one experiment has one row for each time: remove the repetition; or number "
-                "the rows, where two were measured at one time; or, of several experiments, name the column that tells them apart, "
-                'ssm.Model(..., experiment="id"), or pass a dictionary or a list of data sets',
+                "the rows, where two were measured at one time; or, of several experiments, name "
+                'the column that tells them apart, ssm.Model(..., experiment="id"), or pass a '
+                "dictionary or a list of data sets",
                 where=where,
             )
         first[value] = row
