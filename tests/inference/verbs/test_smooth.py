@@ -203,8 +203,7 @@ def test_a_smoother_that_collapsed_says_so(method):
     """Where x hardly moves, one of the first particles is the ancestor of all."""
     y = np.arctan(0.7) + 0.2 * np.random.default_rng(4).normal(size=60)
     call = {"particles": 400, "seed": 5}
-    if method == "fixed_lag":
-        method = ssm.FixedLag(lag=60)
+    method = {"fixed_lag": ssm.FixedLag(lag=60), "ffbsi": ssm.FFBSi(proposal="bootstrap")}[method]
     with pytest.warns(
         UserWarning, match=r"particle degeneracy at t=.*: only . distinct particles? among"
     ):
@@ -214,6 +213,24 @@ def test_a_smoother_that_collapsed_says_so(method):
         warnings.simplefilter("error")
         found = ssm.smooth(still(0.3), {"y": y}, {}, "ffbsi", **call)
     assert "smoothing_warning" not in found.attrs
+
+
+@pytest.mark.slow
+def test_where_the_transition_collapses_the_twisted_proposal_is_taken():
+    """The same data: a particle of the first row, fixed by all rows, has a known posterior."""
+    y = np.arctan(0.7) + 0.2 * np.random.default_rng(4).normal(size=60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = ssm.smooth(still(1e-7), {"y": y}, {}, "ffbsi", particles=400, seed=5)
+    assert found.attrs["proposal"] == "twisted"
+    x = np.linspace(-6.0, 6.0, 20_001)  # x stands still but for 1e-7
+    log_p = -0.5 * (x / 30.0) ** 2 - 0.5 * np.sum((y[:, None] - np.arctan(x)) ** 2, axis=0) / 0.04
+    weight = np.exp(log_p - log_p.max())
+    weight /= weight.sum()
+    mean = weight @ x
+    sd = np.sqrt(weight @ (x - mean) ** 2)
+    first = found["x"].to_numpy().reshape(-1, 60)[:, 0]
+    assert abs(first.mean() - mean) < 5.0 * sd / np.sqrt(400.0)
 
 
 @pytest.mark.slow
