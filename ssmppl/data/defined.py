@@ -13,7 +13,13 @@ from ssmppl.data.sources import Source
 from ssmppl.data.values import name_of, number
 from ssmppl.errors import DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of, to_text
-from ssmppl.expressions.properties import Undefined, first_undefined, may_be_undefined
+from ssmppl.expressions.properties import (
+    DATA,
+    DATA_PREV,
+    Undefined,
+    first_undefined,
+    may_be_undefined,
+)
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.model.trace import Site, Trace, once_per_trace, previous
 
@@ -30,10 +36,6 @@ class _Suspect(NamedTuple):
     weighs: tuple[Expr, ...]  # the components that have to be measured for it to count
 
 
-_DATA = {"input", "time"}
-_DATA_PREV = {"input_prev", "time_prev", "observation_prev"}
-
-
 @once_per_trace
 def _suspects(trace: Trace) -> dict[str, list[_Suspect]]:
     return {
@@ -44,7 +46,7 @@ def _suspects(trace: Trace) -> dict[str, list[_Suspect]]:
             if may_be_undefined(suspect.form, trace.choices, known)
         ]
         for role, known in (
-            ("initial", _DATA), ("transition", _DATA_PREV), ("observations", _DATA),
+            ("initial", DATA), ("transition", DATA_PREV), ("observations", DATA),
         )
     }  # fmt: skip
 

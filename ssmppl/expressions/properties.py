@@ -16,7 +16,8 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, is_tuple, symbols_of, topological
 from ssmppl.expressions.node import BOOLEAN, SEVERAL
 
-DATA = {"input", "input_prev", "time", "time_prev", "observation_prev"}  # kinds of symbols
+# Kinds of symbols whose values the data tell, of the row and of the one before.
+DATA, DATA_PREV = {"input", "time"}, {"input_prev", "time_prev", "observation_prev"}
 
 _OF_ANY = {"exp", "abs", "sqrt"}  # none below 0, of whatever number
 _OF_SUCH = {"add", "mul", "div", "maximum", "minimum"}  # of such numbers such a number
@@ -48,7 +49,7 @@ def never_negative(e: Expr) -> bool:
 def may_vanish_by_data(spread: Iterable[Expr]) -> bool:
     """Whether data enter a variance or a covariance, which may then be singular in some rows: a
     step of no length, an input that switches a noise off."""
-    return any(s.data[0] in DATA for s in symbols_of(spread))
+    return any(s.data[0] in DATA | DATA_PREV for s in symbols_of(spread))
 
 
 def conditions_of(forms: Iterable[Expr]) -> list[Expr]:

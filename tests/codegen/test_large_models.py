@@ -77,3 +77,28 @@ def test_proposals_of_many_channels_are_not_written_out(states, series, written)
     assert isinstance(found["guided"], NotApplicable) is not written
     if not written:
         assert "100 observed components and 2 states" in found["guided"].reason
+
+
+@pytest.mark.parametrize("law", ["counts", "levels"])
+def test_many_channels_with_a_state_each_are_written_out(law):
+    """What counts is what there is to write: here each channel has one state."""
+    n = 60
+    model = ssm.Model(f"sixty {law}")
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(n), sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(np.sin(x), sd=0.3)})
+    if law == "counts":
+        model.observation(lambda x: {"y": ssm.Poisson(np.exp(x))})
+    else:
+        model.observation(lambda x: {"y": ssm.Normal(x, sd=0.5)})
+    assert not isinstance(derive(trace(model), Missing(none=True))["guided"], NotApplicable)
+
+
+def test_counts_of_many_factors_are_not_written_out():
+    model = ssm.Model("counts of factors")
+    loadings = np.random.default_rng(1).normal(size=(60, 20))
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(20), sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.8 * x, sd=0.5)})
+    model.observation(lambda x: {"y": ssm.Poisson(np.exp(loadings @ x))})
+    found = derive(trace(model), Missing(none=True))["guided"]
+    assert isinstance(found, NotApplicable)
+    assert "60 observed components and 20 states" in found.reason

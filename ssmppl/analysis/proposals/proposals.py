@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from ssmppl.analysis.new_values import reached, reads_of, resolved
 from ssmppl.analysis.structure import (
     GaussianBlock,
     affine_observation,
+    exact_observation,
     flat_start,
     gaussian_block,
     singular_states,
@@ -64,8 +65,9 @@ from ssmppl.language.model.trace import Site, Trace, seen
 NEWTON_STEPS = 3
 LONGEST_STEP = 2.0  # in standard deviations of the transition
 DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
-# Of what is written out, entries times the terms of each; 1,000 compile in half a second.
-MOST_TERMS = 8_000
+# What is written out at most, which compiles in some seconds: products of entries of matrices, and
+# nodes of slopes times the states that they are differentiated in once more.
+MOST_PRODUCTS, MOST_NODES = 16_000, 500_000
 LARGEST_EXPONENT = 600.0  # of q / f where exp is taken
 
 
@@ -84,6 +86,8 @@ class Proposal:
     explanation: str = ""
     looped: int = 0  # multiplications per particle, of a proposal that is not written out
     unsuited: str = ""  # why filters other than its own cannot run it, if they cannot
+    # the rows at which states are drawn, and weighed, given the observation in closed form
+    conditioned: Literal["none", "all but the first", "all"] = "none"
 
     @property
     def look_ahead_kind(self) -> str:
@@ -251,21 +255,30 @@ class TooLarge(NotApplicable):
     """Derived, but not written out."""
 
 
-def _channels(trace: Trace) -> int:
-    return sum(len(site.components) for site in trace.observations.values())
-
-
-def _too_large(trace: Trace, *sizes: int) -> TooLarge | None:
-    """Why a proposal is not written out, whose terms are as many as these sizes and the states
-    multiply to."""
-    states, channels = len(trace.state_symbols), _channels(trace)
-    if math.prod(sizes) * states <= MOST_TERMS:
+def _too_large(trace: Trace, size: int, most: int) -> TooLarge | None:
+    """Why a proposal of this size is not written out; None where it is no larger than `most`."""
+    if size <= most:
         return None
+    channels = sum(len(site.components) for site in trace.observations.values())
     return TooLarge(
-        f"with {channels} observed components and {states} states, its conditional distributions "
-        "would fill a program that takes minutes to compile",
+        f"with {channels} observed components and {len(trace.state_symbols)} states, its "
+        "conditional distributions would fill a program that takes minutes to compile",
         next(iter(trace.observations.values())).distribution.location,
     )
+
+
+def _products(q: ExprArray, h: ExprArray, r: ExprArray) -> int:
+    """How many products of entries that are not zero make the covariance H Q H' + R of the
+    observation, and the gain Q H' (H Q H' + R)^-1."""
+    own_q, own_h, own_r = (
+        np.array([e is not constant(0.0) for e in m.ravel()], dtype=int).reshape(m.shape)
+        for m in (q, h, r)
+    )
+    covariance = own_h @ own_q @ own_h.T
+    whole = covariance + own_r
+    apart = np.count_nonzero(whole) == np.count_nonzero(np.diagonal(whole))
+    inverse_ = np.eye(len(own_h), dtype=int) if apart else np.ones_like(covariance)
+    return int(covariance.sum() + (own_q @ own_h.T @ inverse_).sum())
 
 
 # -- tier 2: locally optimal
@@ -285,7 +298,8 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     observation = affine_observation(sites, transition.gaussian.symbols, transition.following)
     if isinstance(observation, NotApplicable):
         return observation
-    large = _too_large(trace, _channels(trace), _channels(trace))
+    q, h, r = transition.gaussian.covariance, observation.matrix, observation.covariance
+    large = _too_large(trace, _products(q, h, r), MOST_PRODUCTS)
     if large is not None:
         return large
     if all(e.op == "const" and e.data == 0.0 for e in observation.matrix.ravel()):
@@ -308,13 +322,15 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
             r = mask_covariance(r, masks)
         draw, predictive = _condition(block, h, r, residual, masks)
         if not sure:  # the sum of the covariances of x and of no law may be one all the same
-            predictive = where_definite(array(r), predictive, may_vanish_by_data(r.ravel()))
+            singular = exact_observation(trace) is not None or may_vanish_by_data(r.ravel())
+            predictive = where_definite(array(r), predictive, singular)
         return split.complete(draw), predictive
 
     draw, predictive = law(transition)
     start = split(trace, list(trace.initial.values()))
     same = set(start.gaussian.symbols) == set(transition.gaussian.symbols)
-    if same and not transition.following:
+    given_first = same and not transition.following
+    if given_first:
         place = {s: i for i, s in enumerate(start.gaussian.symbols)}  # no .index: == is symbolic
         order = [place[s] for s in transition.gaussian.symbols]
         start = replace(start, gaussian=_reorder(start.gaussian, order))
@@ -336,6 +352,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         (weight,),
         look_ahead,
         exact_look_ahead=look_ahead is not None,
+        conditioned="all" if given_first else "all but the first",
         explanation="locally optimal: particles are drawn from p(x_t | x_{t-1}, y_t), which is "
         "Gaussian, and weighed by p(y_t | x_{t-1})",
     )
@@ -389,9 +406,6 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     sites = list(trace.observations.values())
     if not sites:
         return NotApplicable("there is no observation")
-    large = _too_large(trace, len(trace.state_symbols), _channels(trace))
-    if large is not None:
-        return large
     observed = terms(trace, "observation", missing)
     # the density without the guards of its support: these depend on y alone or end the particle
     smooth = terms(trace, "observation", missing, guard=False)
@@ -411,6 +425,11 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         return NotApplicable("no state with a Gaussian transition is observed", where)
     try:
         slope = array(gradient(total, transition.gaussian.symbols))
+        own = set(transition.gaussian.symbols)
+        nodes = sum(len(topological([e])) * len(symbols_of(e) & own) for e in slope)
+        large = _too_large(trace, nodes, MOST_NODES)
+        if large is not None:
+            return large
         curvature = hessian(total, transition.gaussian.symbols)
     except NotDifferentiable as error:
         return NotApplicable(f"the observation is not twice differentiable: {error.found}", where)

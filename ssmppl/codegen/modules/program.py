@@ -91,7 +91,7 @@ class Proposals(Mapping[str, Proposal | NotApplicable]):
         return iter(dict.fromkeys((*(n for n in self._derived if n != "twisted"), "twisted")))
 
     def __len__(self) -> int:
-        return len(list(iter(self)))
+        return len({*self._derived, "twisted"})
 
 
 @dataclass
@@ -272,12 +272,12 @@ def _with_densities(
 ) -> Proposal | NotApplicable:
     """The proposal, unless it asks for a density that does not exist in some row of the data: of
     the observation, where it is what particles weigh, or of the states, where these are drawn by
-    Newton steps. Those that are conditioned on the observation in closed form ask for neither."""
-    if isinstance(proposal, NotApplicable) or proposal.exact_look_ahead:
+    Newton steps."""
+    if isinstance(proposal, NotApplicable):
         return proposal
-    if missing.noise is not None:
+    if missing.noise is not None and proposal.conditioned != "all":
         return missing.noise
-    fitted = proposal.name in ("guided", "auxiliary")
+    fitted = proposal.name in ("guided", "auxiliary") and proposal.conditioned == "none"
     return missing.spread if fitted and missing.spread is not None else proposal
 
 

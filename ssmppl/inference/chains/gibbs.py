@@ -45,11 +45,20 @@ from ssmppl.inference.preparation.exact_models import (
     filter_of,
     log_increments,
 )
-from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode, without_climb
+from ssmppl.inference.preparation.pilot import (
+    Pilot,
+    averaged_density,
+    dispersed,
+    find_mode,
+    finite_point,
+)
+from ssmppl.inference.preparation.space import at
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.draws import Block
+from ssmppl.inference.run.seeds import random_state
 
-MANY = 20  # numbers beyond which no mode is looked for, as their closed forms find it sooner
+MANY = 50  # numbers beyond which a simplex does not find the mode, and sweeps tell where it is
+SWEEPS = 100  # of which the second half counts
 
 
 @dataclass(frozen=True)
@@ -85,9 +94,11 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
     need_density(problem.trace, "Gibbs", "sample")
     kind, updates = filter_of(model), plan_updates(problem, setup.fixed)
     if space.positions.size:
-        drawn = all(u.family is not None for u in updates)
-        find = without_climb if drawn and len(space.positions) > MANY else find_mode
-        pilot = setup.once("pilot", lambda: find(space, setup.root, kind))
+        if all(u.family is not None for u in updates) and len(space.positions) > MANY:
+            bare = GibbsSweeper(problem, updates)
+            pilot = setup.once("pilot", lambda: _pilot_by_sweeps(setup, bare, model, kind))
+        else:
+            pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
         check_mode(model, problem.experiments, space.parameters(pilot.z)[0])
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
@@ -108,6 +119,31 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
     return PreparedChains(partial(gibbs_block, steps, setup.thin, setup.states), states, report)
+
+
+def _pilot_by_sweeps(
+    setup: SamplingSetup, steps: GibbsSweeper, model: ExactModel, kind: str
+) -> Pilot:
+    """The mean and standard deviation of plain sweeps, in place of a mode and the scale there.
+
+    Raises
+    ------
+    ArgumentError : the likelihood is zero at every point that was tried.
+    """
+    space, root = setup.space, setup.root
+    own = np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 8))
+    generator, stream = np.random.default_rng(own), random_state(own)
+    density = averaged_density(space, root, kind, 1)
+    z = finite_point(space.z[space.positions], density, generator)
+    theta, found = space.parameters(z)[0].copy(), []
+    for _ in range(SWEEPS):
+        draw_parameters(steps, theta, draw_paths(steps, model, theta, stream), generator)
+        found.append(at(space, theta).z[space.positions])
+    half = np.array(found[SWEEPS // 2 :])
+    centre = half.mean(axis=0)
+    if density(centre) == -np.inf:
+        centre = half[-1]
+    return Pilot(centre, half.std(axis=0), density(centre))
 
 
 def gibbs_block(

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssmppl.codegen.modules.exact import exact_entry
 from ssmppl.data import Experiment
-from ssmppl.inference.exact.hidden_markov import HiddenMarkov, Tables
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -52,25 +53,9 @@ def viterbi_paths(
     found: dict[int, tuple[np.ndarray, float]] = {}
     for h in exact.histories_of(experiments):
         tables = exact.tables(h, theta)
-        each = [_path(tables, s, slice(*h.first[s : s + 2])) for s in range(h.size)]
+        paths, heights = np.empty(len(h.y), dtype=np.int64), np.empty(h.size)
+        logs = tables.log_start, tables.log_move, tables.log_g
+        exact_entry("finite_viterbi")(h.first, *logs, paths, heights)
         for i, s in zip(h.members, h.which, strict=True):
-            index, height = each[s]
-            found[int(i)] = exact.values[index], height
+            found[int(i)] = exact.values[paths[h.of(s)]], float(heights[s])
     return [found[i] for i in range(len(found))]
-
-
-def _path(tables: Tables, s: int, rows: slice) -> tuple[np.ndarray, float]:
-    """(T,) index of the value at each row of history s, and the log probability."""
-    log_g = tables.log_g[rows]
-    move = tables.log_move[rows] if len(tables.log_move) > 1 else tables.log_move
-    best = tables.log_start[s] + log_g[0]
-    from_where = np.zeros(log_g.shape, dtype=np.int64)
-    for t in range(1, len(log_g)):
-        reached = best[:, None] + move[t if len(move) > 1 else 0]  # before, now
-        from_where[t] = np.argmax(reached, axis=0)
-        best = np.max(reached, axis=0) + log_g[t]
-    index = np.empty(len(log_g), dtype=np.int64)
-    index[-1] = np.argmax(best)
-    for t in range(len(log_g) - 1, 0, -1):
-        index[t - 1] = from_where[t, index[t]]
-    return index, float(best[index[-1]])

@@ -33,6 +33,7 @@ FARTHEST = (
 )  # the last of them: nothing is left inside, nor is it rounded to nothing
 INWARDS = tuple(np.arange(2.0, 65.0, 2.0).tolist())  # so close that no hill lies between
 WIDER = 6.0  # steps beyond, which begin where the objective is as flat as rounding leaves it
+LOGS = 745.0  # of the least number that is not zero: how far out a logarithm may be
 ROUNDING = 1e-9  # of the objective, relative
 AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb is not finished
 FALL = 0.5  # of the objective inwards: half a unit, as at one standard error of a normal law
@@ -61,7 +62,7 @@ def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.nd
         inwards = [moved(j, sign * s) for s in INWARDS]
         if max(inwards) > AT_MOST:
             return False
-        beyond = np.arange(INWARDS[-1] + WIDER, abs(z[j]) + INWARDS[-1], WIDER)
+        beyond = np.arange(INWARDS[-1] + WIDER, min(abs(z[j]), LOGS) + INWARDS[-1], WIDER)
         before = 0.0
         for change in itertools.chain(inwards, (moved(j, sign * s) for s in beyond)):
             if change > AT_MOST:

@@ -68,35 +68,6 @@ def find_mode(
     return Pilot(best, scale_of(best, averaged, space.on_the_line), value)
 
 
-def without_climb(space: Space, seed: np.random.SeedSequence, proposal: str) -> Pilot:
-    """The space's own point, or one near it with a finite likelihood, and the scale there: of many
-    numbers, for chains that get from anywhere to the mode sooner than a simplex does. Components of
-    one parameter have the scale of the first.
-
-    Raises
-    ------
-    ArgumentError : the likelihood is zero at every point that was tried.
-    """
-    averaged = averaged_density(space, seed, proposal, SCALE_REPEATS)
-    rng = np.random.default_rng(seed)
-    try:
-        z = finite_point(space.z[space.positions], averaged, rng)
-    except ArgumentError as error:
-        raise explained(error, space) from None
-    on_the_line, scale = space.on_the_line, np.empty(len(z))
-    for site in np.unique(space.sites):
-        own = np.flatnonzero(space.sites == site)
-        first = own[0]
-
-        def along(v: np.ndarray, first: int = first) -> float:
-            there = z.copy()
-            there[first] = v[0]
-            return averaged(there)
-
-        scale[own] = scale_of(z[[first]], along, on_the_line[[first]])
-    return Pilot(z, scale, averaged(z))
-
-
 def climb_to_mode(
     space: Space, seed: np.random.SeedSequence,
     estimate: Callable[[np.ndarray, np.random.SeedSequence], float],

@@ -170,7 +170,7 @@ def _pilot(
     if min((s for s, _ in figures.values()), default=np.inf) > ENOUGH:
         _try(problem, theta, last_resort, figures)
     score = {n: s**2 * c for n, (s, c) in figures.items() if np.isfinite(s)}
-    best = min(score, key=lambda n: score[n]) if score else "bootstrap"
+    best = min(score, key=lambda n: score[n]) if score else next(iter(candidates), "bootstrap")
     return Choice(best, figures)
 
 
@@ -219,11 +219,12 @@ def resolve_settings(
     *,
     whole: bool = False,
     integrate: bool = False,
+    temper: bool = False,
     device: str = "cpu",
 ) -> FilterSettings:
     """The settings of a call with "auto" resolved, checked against what could be derived.
 
-    whole, integrate : as in `choose_by_pilot`.
+    whole, integrate, temper : as in `choose_by_pilot`.
     """
     settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
     each = 2 * len(problem.trace.state_symbols) + 2  # of this row and the last; weight and ancestor
@@ -232,7 +233,7 @@ def resolve_settings(
         return _on_device(problem, theta, settings, resampling, device)
     if proposal == "auto":
         fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
-        flags = {"whole": whole, "integrate": integrate, "temper": whole and fixed}
+        flags = {"whole": whole, "integrate": integrate, "temper": temper and fixed}
         chosen = choose_by_pilot(problem, theta, **flags).name
         return replace(settings, proposal=chosen)
     if proposal in EXACT:

@@ -43,13 +43,6 @@ class Space:
         found = [x for t in transforms(self.problem.trace) for x in t.on_the_line]
         return np.array(found, dtype=bool)[self.positions]
 
-    @property
-    def sites(self) -> np.ndarray:
-        """(free numbers,) the number of the parameter that each is of."""
-        sizes = [len(t.free) for t in transforms(self.problem.trace)]
-        found: np.ndarray = np.repeat(np.arange(len(sizes)), sizes)[self.positions]
-        return found
-
     def parameters(self, z_free: np.ndarray) -> tuple[np.ndarray, float]:
         """(theta, log prior + log Jacobian) at unconstrained values of the free parameters."""
         theta, log_prior, log_jacobian = self.point(z_free)

@@ -125,7 +125,7 @@ def log_likelihood(
         return np.full(repeats, value)
     settings = resolve_settings(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, whole=True,
-        integrate=True, device=device,
+        temper=True, integrate=True, device=device,
     )  # fmt: skip
     if settings.proposal in EXACT:
         if proposal == "auto" and settings.proposal == "extended":

@@ -166,6 +166,41 @@ def test_states_that_are_not_linear():
     assert "Laplace approximation none: y is observed without noise" in plan
 
 
+def test_an_exact_channel_beside_a_noisy_one():
+    """Of a variance that is a parameter: the covariance of both is singular, and no reason for a
+    likelihood of zero. By a grid of the first state."""
+    model = ssm.Model("exact and noisy")
+    model.prior(lambda: {"r": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1), "s": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, s: {
+        "x": ssm.Normal(np.sin(2 * x), sd=0.6), "s": ssm.Normal(0.5 * s, sd=0.4)
+    })  # fmt: skip
+    model.observation(lambda x, s, r: {"y": ssm.Dirac(x + s), "z": ssm.Normal(x, sd=r)})
+    y, z = np.array([0.3, -0.4, 0.8, 0.1]), np.array([0.1, np.nan, 0.9, -0.3])
+    x = np.linspace(-5.0, 5.0, 1001)
+    step, normal = x[1] - x[0], scipy.stats.norm.pdf
+    mass = normal(x) * normal(y[0] - x) * normal(z[0], x, 0.7) * step
+    for t in range(1, len(y)):
+        move = normal(x[:, None], np.sin(2 * x)[None, :], 0.6)
+        other = normal((y[t] - x)[:, None], 0.5 * (y[t - 1] - x)[None, :], 0.4)
+        mass = (move * other) @ mass * step
+        mass *= 1.0 if np.isnan(z[t]) else normal(z[t], x, 0.7)
+    log_z = ssm.log_likelihood(
+        model, {"y": y, "z": z}, {"r": 0.7}, particles=300, repeats=300, seed=1
+    )
+    assert mean_one_p(log_z - np.log(mass.sum())) > 1e-3
+
+
+def test_a_first_row_that_no_particle_can_meet_is_refused():
+    """Its state is drawn without a look at the observation, as it is not Gaussian."""
+    model = ssm.Model("uniform start")
+    model.initial(lambda: {"x": ssm.Uniform(-1, 1)})
+    model.transition(lambda x: {"x": ssm.Normal(np.sin(2 * x), sd=0.6)})
+    model.observation(lambda x: {"y": ssm.Dirac(x)})
+    with pytest.raises(ssm.ArgumentError, match="observed without noise"):
+        ssm.log_likelihood(model, {"y": np.array([0.2, 0.4])}, {}, seed=1)
+
+
 def test_what_is_not_affine_is_refused():
     model = ssm.Model("square")
     model.initial(lambda: {"x": ssm.Normal(0, sd=1)})

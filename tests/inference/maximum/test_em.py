@@ -7,6 +7,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters, check_values
 from ssmppl.datasets import load
+from ssmppl.inference.maximum import em
 from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.em import ExactSteps
 from ssmppl.inference.maximum.em import climb as climb_em
@@ -265,3 +266,17 @@ def test_a_root_that_a_condition_guards():
         for method in (ssm.EM(), ssm.DirectOptimization())
     ]
     assert found[0].parameters == pytest.approx(found[1].parameters, rel=1e-4)
+
+
+def test_slow_steps_are_told(monkeypatch):
+    """Where the maximum of a step has no closed form, by how long all of them may take."""
+    monkeypatch.setattr(em, "PATIENCE", 0.0)
+    model = ssm.Model("partly missing")
+    model.prior(lambda: {"R": ssm.InverseWishart(4, scale=np.eye(2))})
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(2), sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.8 * x, sd=0.5)})
+    model.observation(lambda x, R: {"y": ssm.MvNormal(x, covariance=R)})
+    y = np.random.default_rng(1).normal(size=(20, 2))
+    y[[3, 8], 0] = np.nan
+    with pytest.warns(UserWarning, match=r"EM may take up to .* no closed form .*DirectOpt"):
+        ssm.maximize(model, {"y": y}, ssm.EM(iterations=6), seed=1, progress=False)

@@ -258,3 +258,35 @@ def sample_backward_logs(first, move, filtered, which, uniforms, paths):
                 total += w[i]
             paths[k] = chosen_of(w, uniforms[k] * total)
         at += end - begin
+
+
+@exact
+def viterbi(first, log_start, log_move, log_g, paths, heights):
+    """Fill paths (R,) with the indices of the most probable values of each sequence together, and
+    heights (S,) with the log probability of path and data."""
+    rows, n = log_g.shape
+    came_from = np.empty((rows, n), dtype=np.int32)
+    best, new = np.empty(n), np.empty(n)
+    for s in range(heights.size):
+        begin, end = first[s], first[s + 1]
+        for j in range(n):
+            best[j] = log_start[s, j] + log_g[begin, j]
+        for t in range(begin + 1, end):
+            a = t if log_move.shape[0] > 1 else 0
+            for j in range(n):
+                most, way = -np.inf, 0
+                for i in range(n):
+                    if best[i] + log_move[a, i, j] > most:
+                        most, way = best[i] + log_move[a, i, j], i
+                new[j], came_from[t, j] = most + log_g[t, j], way
+            for j in range(n):
+                best[j] = new[j]
+        at = 0
+        for j in range(n):
+            if best[j] > best[at]:
+                at = j
+        heights[s] = best[at]
+        for t in range(end - 1, begin - 1, -1):
+            paths[t] = at
+            if t > begin:
+                at = came_from[t, at]
