@@ -122,6 +122,13 @@ def test_what_needs_a_density_is_refused_by_row(build, named, method):
     assert "has no density" not in str(ssm.explain(model))
 
 
+def test_the_diagnosis_is_refused_by_row():
+    model, data, *_ = posed(walk)
+    with pytest.raises(ssm.ArgumentError, match=r"row 2 \(dt = 0\)") as caught:
+        ssm.diagnose(model, data, mode="fast", seed=1, progress=False)
+    assert "leave out the rows" in str(caught.value)
+
+
 def test_proposals_by_newton_steps_are_refused_by_row():
     """They divide by the covariance of the states; those of the twisted filter do not, and agree
     with the transition's."""

@@ -26,12 +26,15 @@ def need_density(trace: Trace, method: str, verb: str) -> None:
         return
     linear = not isinstance(linear_gaussian(trace), NotApplicable)
     exact = reason == exact_observation(trace)
-    written = (
-        "give the observation some noise"
-        if exact
-        else "write components that follow without a noise of their own as states of distribution "
-        "ssm.Dirac"
-    )
+    if exact:
+        written = "give the observation some noise"
+    elif reason == trace.singular_row:
+        written = "leave out the rows in which it is so, or give the states a little noise there"
+    else:
+        written = (
+            "write components that follow without a noise of their own as states of distribution "
+            "ssm.Dirac"
+        )
     if verb in WITHOUT and not (exact and not linear and verb in ("maximize", "score")):
         written = f"use {WITHOUT[verb][0 if linear else 1]}, which needs none; or {written}"
     raise ArgumentError(
