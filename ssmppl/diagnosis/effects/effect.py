@@ -73,9 +73,10 @@ from ssmppl.language.model.pickling import holder_of
 _MISSING: Any = None
 Bounds = tuple[float, float] | None
 
-# The most strength of a delay. Beyond 1 it extrapolates, and one of two rows at twice the strength
-# passes for one of four; what is over leaves an estimate near 1 its error.
-MOST_DELAYED = 1.25
+# The most strength of an effect that is whole at 1. Beyond, a delay extrapolates, so that one of 2
+# rows at twice the strength passes for one of 4, and a limit folds what exceeds it back: pulses in
+# the few highest rows. What is over leaves an estimate near 1 its error.
+WHOLE = 1.25
 
 # The words of a declaration: see the tables above.
 KINDS = ("transition", "observation", "input", "noise", "tail", "parameter", "initial", "state")

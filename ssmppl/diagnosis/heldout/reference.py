@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -82,11 +83,7 @@ def fit_reference(
     """
     groups = significant_groups(screen, chosen)
     if groups and split is not None:
-        found = checkpoint.computed(
-            "reference on other rows",
-            lambda: {"groups": _worth(augmented, chosen, start, groups, split, seed)},
-        )
-        groups = [g for g, kept in zip(groups, found["groups"], strict=True) if kept]
+        groups = _worth(augmented, chosen, start, groups, split, seed, checkpoint)
     for count in dict.fromkeys((len(groups), 1)) if groups else ():
         fitter, begin = superset(augmented, chosen, start, groups[:count])
 
@@ -103,25 +100,45 @@ def fit_reference(
 
 
 def _worth(
+    augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit, groups: Sequence[Group],
+    split: RowSplit, seed: np.random.SeedSequence, checkpoint: Checkpoint,
+) -> list[Group]:  # fmt: skip
+    """The groups that, one after the other, predict the second part better than those before; none
+    where the model without them predicts nothing."""
+
+    def values(wanted: Sequence[tuple[int, ...]], stage: str) -> list[float]:
+        sets = [[groups[k] for k in each] for each in wanted]
+        one = partial(_predicted, augmented, tuple(chosen), start, sets, split, seed)
+        found = checkpoint.map(stage, len(sets), one)
+        failed = [checkpoint.failures.record_task(stage, numbers) for numbers in found]
+        return [
+            -np.inf if lost else float(numbers["value"])
+            for lost, numbers in zip(failed, found, strict=True)
+        ]
+
+    # Each by itself at once; most are of no use, and then that is all.
+    alone = [(k,) for k in range(len(groups))]
+    best, *singly = values([(), *alone], "reference on other rows")
+    kept: tuple[int, ...] = ()
+    for k, value in enumerate(singly if np.isfinite(best) else []):
+        if kept:
+            (value,) = values([(*kept, k)], f"reference on other rows with {(*kept, k)}")
+        if value > best:
+            kept, best = (*kept, k), value
+    return [groups[k] for k in kept]
+
+
+def _predicted(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
-    groups: Sequence[Group], split: RowSplit, seed: np.random.SeedSequence,
-) -> np.ndarray:  # fmt: skip
-    """(G,) bool: the groups that, one after the other, predict the second part better than those
-    before; none where the model without them predicts nothing."""
-
-    def value(wanted: Sequence[Group]) -> float:
-        fitter, begin = superset(augmented, chosen, start, wanted)
-        try:
-            return predicted_later(fitter, begin, split, seed)
-        except SSMError:
-            return -np.inf
-
-    best, kept = value([]), np.zeros(len(groups), dtype=bool)
-    for k in range(len(groups) if np.isfinite(best) else 0):
-        kept[k] = True
-        new = value([g for g, taken in zip(groups, kept, strict=True) if taken])
-        kept[k], best = new > best, max(new, best)
-    return kept
+    sets: Sequence[Sequence[Group]], split: RowSplit, seed: np.random.SeedSequence, k: int,
+) -> Numbers:  # fmt: skip
+    """What the superset with the groups `sets[k]` predicts of the second part, fitted to the first;
+    -inf where it cannot."""
+    fitter, begin = superset(augmented, chosen, start, sets[k])
+    try:
+        return {"value": np.array(predicted_later(fitter, begin, split, seed))}
+    except SSMError:
+        return {"value": np.array(-np.inf)}
 
 
 def gain_of_curves(

@@ -33,6 +33,7 @@ from ssmppl.diagnosis.selection.backward import needed_only
 from ssmppl.diagnosis.selection.equivalence import FORM
 from ssmppl.diagnosis.selection.horizons import SimulationGain
 from ssmppl.diagnosis.selection.input_delays import promising_delays
+from ssmppl.diagnosis.selection.other_end import at_the_other_end
 from ssmppl.diagnosis.selection.overlooked import (
     best_start,
     elsewhere,
@@ -195,6 +196,8 @@ class EffectSelection:
                 refits = best_of_groups(screen, refits + more)
                 out.notes += [f"not refitted: {reason}" for reason in failed]
         if self.singles is None:
+            with self.checkpoint.failures.guard("lags and delays at the other end"):
+                refits = best_of_groups(screen, refits + self._at_the_other_end(out, refits))
             with self.checkpoint.failures.guard("mechanisms that the screen overlooks"):
                 refits = best_of_groups(screen, refits + self._overlooked(out, refits))
         out.refits = refits
@@ -208,6 +211,19 @@ class EffectSelection:
             self.augmented.base_fitter, out.base.theta, self.screen, self.train, worth
         )
         return [k for k in found if int(self.screen.groups[k]) not in done][:1]
+
+    def _at_the_other_end(self, out: SelectionResult, refits: Sequence[Refit]) -> list[Refit]:
+        """Lags and delays of inputs beside the best of a sensor, and the other way round."""
+        worth = PROMISING * max((r.score for r in refits), default=0.0)
+        worth = max(worth, critical_gain(self.screen, self.alpha))
+        fitter = self.augmented.base_fitter
+        found = at_the_other_end(fitter, self.screen, refits, self.train, worth)
+        more, failed = self._refit(
+            out, out.base, self.screen, [[k] for k, _ in found], self._seed(Choice.OTHER_END),
+            "refitting lags and delays at the other end", begins=[begin for _, begin in found],
+        )  # fmt: skip
+        out.notes += [f"not refitted: {reason}" for reason in failed]
+        return more
 
     def _overlooked(self, out: SelectionResult, refits: Sequence[Refit]) -> list[Refit]:
         """Mechanisms where what only describes a misfit gains most."""

@@ -5,7 +5,8 @@ a parameter has taken on part of the effect, that tells little: a drag that the 
 stands in for, or a stop, beyond which the simulated sets go and the data never do. So where what
 only describes a misfit gains most, the mechanisms of the same equation are fitted too, each from
 the best of a few strengths and shapes: those of the screen, and others all over the range of each,
-as a stop that is touched twice lies further out than the screen looks.
+as a stop that is touched twice lies further out than the screen looks. The range of each sensor is
+looked at whatever leads.
 """
 
 from __future__ import annotations
@@ -19,6 +20,12 @@ import numpy as np
 from ssmppl.analysis.structure import simulators
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.effects.catalogue_sensor import (
+    both_clippings,
+    lower_clipping,
+    saturating_gain,
+    upper_clipping,
+)
 from ssmppl.diagnosis.effects.effect import MECHANISM
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import Fit
@@ -40,25 +47,30 @@ ELSEWHERE = 7  # values of a shape between its bounds
 PRICE = 1.0  # nats that a shape elsewhere has to gain
 # Further ones, where it still rises: a threshold further out has larger standard errors.
 BEYOND = (256.0, 1024.0, 4096.0, 16384.0)
+# A filter follows what a sensor shows, and so never goes beyond the end of its range; and what the
+# readings bend is, at a strength of zero, often taken up by the parameters.
+RANGES = (upper_clipping, lower_clipping, both_clippings, saturating_gain)
+BENT = (0.05, 0.15, 0.45, 0.9)  # strengths of these, of which 1 is the whole
 HOPELESS = 20.0  # nats below the model as it is, beyond which larger strengths are not tried
 
 
 def overlooked(screen: Screen, refits: Sequence[Refit], worth: float) -> list[list[int]]:
     """The shapes of each mechanism, by their columns, that acts in the equation of the refit that
-    would be named, where that is none; the highest in the screen first. Of those that were refitted
-    the ones that have shapes to estimate.
+    would be named, where that is none, and of what limits the range of a sensor; the highest in the
+    screen first. Of those that were refitted the ones that have shapes to estimate.
 
     worth : nats that the best one has to gain.
     """
     if not refits or (best := preferred(refits, worth)[0]).penalised_gain < worth:
         return []
     c, done = best.candidates[0], {int(screen.groups[r.index[0]]) for r in refits}
-    if c.effect.cause == MECHANISM:
-        return []
-    places, out = _equations(c, screen.design.trace), []
+    places = set() if c.effect.cause == MECHANISM else _equations(c, screen.design.trace)
+    out = []
     for head in screen.family.leaders:
         group, c = int(screen.groups[head]), screen.design.candidates[head]
-        if not _acts(c, places) or (group in done and not shape_bounds(c, screen.design.scales)):
+        if not (_acts(c, places) or c.effect in RANGES):
+            continue
+        if group in done and not shape_bounds(c, screen.design.scales):
             continue
         shapes = [k for k in np.flatnonzero(screen.groups == group).tolist() if _allowed(screen, k)]
         if shapes:
@@ -85,6 +97,8 @@ def _acts(c: Candidate, places: set[str]) -> bool:
 
 def _allowed(screen: Screen, k: int) -> bool:
     found = screen.efficient
+    if screen.design.candidates[k].effect in RANGES:
+        return True
     return not found.status[k] and found.sided[k] * found.z[k] >= -AGAINST
 
 
@@ -153,12 +167,14 @@ def most_promising(
 
 
 def _signs(c: Candidate) -> tuple[int, ...]:
-    return (c.sided,) if c.sided else (1, -1)
+    return (c.sided,) if c.sided else (1,) if c.effect in RANGES else (1, -1)
 
 
 def _strengths(screen: Screen, k: int) -> np.ndarray:
     """Strengths (without sign) of a column, inside its bounds, the smallest first; behind the grid
     those that are tried while the likelihood rises."""
+    if screen.design.candidates[k].effect in RANGES:
+        return np.array(BENT)
     squares = screen.simulated.squares[:, [k]]
     share = float(screen.observed.squares[k] / typical_squares(squares)[0])
     share = min(share, 1.0) if share > 0.0 else 1.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -74,10 +74,11 @@ LOST = 2.0  # nats below the model that it contains: a fit that ends there has f
 @dataclass(frozen=True)
 class Begin:
     """Where the refit of a single effect begins. shape : of it, where that is another than the
-    screen's."""
+    screen's. parameters : of the model, where those are others than the base fit's."""
 
     strength: float
     shape: Mapping[str, float]
+    parameters: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -147,12 +148,12 @@ class Refit:
 def refit(
     augmented: AugmentedModels, base: Fit, screen: Screen, index: Sequence[int],
     train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
-    afresh: bool = False, approximate: bool = False, strength: float | None = None,
+    afresh: bool = False, approximate: bool = False, begin: Begin | None = None,
 ) -> Refit | NotApplicable:  # fmt: skip
     """Fit the model with the effects of `candidates`, of which the last are the screen's at
     `index`, and the others are in `base`.
 
-    strength : of a single effect, from which the fit starts; None: what the screen's score says.
+    begin : where the fit of a single effect starts; None: where the screen's score says.
     afresh : from the model's own start, with the strengths that the effects declare for that.
     approximate : as of `Effort`.
     """
@@ -168,8 +169,9 @@ def refit(
         if afresh:
             strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
             fit = fitter.fit(train, seed, strengths)
-        elif strength is not None:
-            start = base.by_parameter | {candidates[-1].strength: np.asarray(strength)}
+        elif begin is not None:
+            start = base.by_parameter | dict(begin.parameters)
+            start[candidates[-1].strength] = np.asarray(begin.strength)
             fit = fitter.fit(train, seed, start, effort)
         else:
             start = start_at(base, screen.design, screen.efficient, index)
@@ -485,9 +487,9 @@ def _one(
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
     own = child_seed(seed, Task.REFIT, k)
-    strength = None if begins is None else begins[k].strength
+    begin = None if begins is None else begins[k]
     found = refit(
-        augmented, base, screen, sets[k], train, own, added[k], afresh, approximate, strength
+        augmented, base, screen, sets[k], train, own, added[k], afresh, approximate, begin
     )
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}

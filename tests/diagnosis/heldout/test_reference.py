@@ -25,11 +25,12 @@ WITHOUT, FAILS = "", None
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ({WITHOUT: 1.0, "a": 2.0, "ab": 3.0, "abc": 4.0}, "abc"),
-        ({WITHOUT: 1.0, "a": 0.5, "b": 2.0, "bc": 1.5}, "b"),
+        ({WITHOUT: 1.0, "a": 2.0, "b": 0.0, "c": 0.0, "ab": 3.0, "abc": 4.0}, "abc"),
+        ({WITHOUT: 1.0, "a": 2.0, "b": 5.0, "c": 3.0, "ab": 1.5, "ac": 2.5}, "ac"),
+        ({WITHOUT: 1.0, "a": 0.5, "b": 2.0, "c": 4.0, "bc": 1.5}, "b"),
         ({WITHOUT: 1.0, "a": FAILS, "b": 0.5, "c": 9.0}, "c"),
         ({WITHOUT: 1.0, "a": 0.5, "b": 0.6, "c": 1.0}, ""),
-        ({WITHOUT: FAILS}, ""),
+        ({WITHOUT: FAILS, "a": 0.5, "b": 0.6, "c": 1.0}, ""),
     ],
 )
 def test_groups_are_taken_in_where_each_predicts_other_rows_better(monkeypatch, values, expected):
@@ -46,8 +47,8 @@ def test_groups_are_taken_in_where_each_predicts_other_rows_better(monkeypatch, 
     )  # fmt: skip
     monkeypatch.setattr(reference, "predicted_later", lambda names, *_: fit(names))
     groups = [(name, 1.0) for name in "abc"]
-    kept = reference._worth(None, (), None, groups, object(), None)
-    assert "".join(name for name, k in zip("abc", kept, strict=True) if k) == expected
+    kept = reference._worth(None, (), None, groups, object(), None, Checkpoint(None, {}))
+    assert "".join(name for name, _ in kept) == expected
 
 
 def test_groups_come_by_how_far_they_stand_out(monkeypatch):
@@ -95,7 +96,7 @@ def test_it_is_told_whether_the_reference_has_curves(monkeypatch, chosen, curves
 def test_without_curves_it_is_the_model_itself_as_it_was_fitted(monkeypatch):
     """And not a further fit of it, which would pass for one with curves."""
     monkeypatch.setattr(reference, "significant_groups", lambda *_: [([], 1.0)])
-    monkeypatch.setattr(reference, "_worth", lambda *_: np.array([False]))
+    monkeypatch.setattr(reference, "_worth", lambda *_: [])
     chosen, start, own = ("drag",), object(), object()
     augmented = SimpleNamespace(fitter=lambda c: own if c == chosen else None)
     found = reference.fit_reference(

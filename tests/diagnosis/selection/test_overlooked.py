@@ -196,3 +196,46 @@ def test_those_that_gain_most_are_fitted(stopped, monkeypatch):
     assert [float(n["gain"]) for n in refitted] == [3.0, 1.0]
     monkeypatch.setattr(module, "FITTED", 2)
     assert [float(n["gain"]) for n in most_promising(starts, trace)] == [5.0, 3.0]
+
+
+# -- what limits the range of a sensor
+@pytest.fixture(scope="module")
+def clipped():
+    """The mass with a sensor that shows nothing above 0.8."""
+    rng, (x, v), y = np.random.default_rng(seed_of("clipped")), (0.0, 0.0), np.empty(LONG)
+    t = SHORT * np.arange(LONG)
+    u = 1.2 * np.sin(0.9 * t) + 0.9 * np.sin(2.1 * t + 1.0)
+    for k in range(LONG):
+        y[k] = min(x, 0.8) + 0.003 * rng.standard_normal()
+        x, v = x + SHORT * v, v + SHORT * (u[k] - 0.4 * v - x) + 0.01 * rng.standard_normal()
+    problem = pose(mass(), {"u": u, "y": y})
+    train, missing = problem.experiments, missing_of(problem.experiments)
+    augmented = AugmentedModels(problem.trace, missing, {}, Settings())
+    base = augmented.base_fitter.fit(train, seed_sequence(1), {})
+    states = augmented.base_fitter.states(train[0], base.theta, random_state(seed_sequence(2)))
+    scales = Scales.of(problem.trace, states, train[0].y, train[0].u, LONG)
+    effects = ["sensor clipping", "sensor gain nonlinearity", "missing input", "quadratic drag"]
+    design = ScreenDesign(problem.trace, scales, missing, (), Settings(), effects)
+    screen = run_screen(design, train, base.theta, 60, seed_sequence(3), Checkpoint(None, {}))
+    return augmented, base, screen, train
+
+
+def test_the_range_of_a_sensor_is_looked_at_whatever_leads(clipped):
+    screen = clipped[2]
+    drag = refit(screen, column(screen, "quadratic drag", "v"))
+    found = told(screen, overlooked(screen, [drag], 10.0))
+    assert {(e, f) for e, f, _ in found} == {
+        ("sensor clipping", "upper"), ("sensor clipping", "lower"),
+        ("sensor clipping", "both ends"), ("sensor gain nonlinearity", "saturating"),
+    }  # fmt: skip
+
+
+def test_a_limit_that_no_filtered_state_goes_beyond_is_found_at_its_place(clipped):
+    augmented, base, screen, train = clipped
+    shapes = [k for k, c in enumerate(screen.design.candidates)
+              if (c.effect.name, c.form) == ("sensor clipping", "upper")]  # fmt: skip
+    found = best_start(augmented, base, screen, [shapes], train, 0)
+    c = screen.design.candidates[int(found["column"])]
+    assert 0.5 < elsewhere(found).get("c", dict(c.shape)["c"]) < 0.85
+    assert float(found["gain"]) > 10.0
+    assert float(found["strength"]) in module.BENT
