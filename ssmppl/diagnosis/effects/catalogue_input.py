@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ssmppl.diagnosis.effects.effect import (
-    WHOLE,
+    MOST_STRENGTH,
     Auxiliary,
     declared,
     effect,
@@ -22,14 +22,14 @@ from ssmppl.language.distributions import Dirac, Normal
 
 
 # -- static nonlinearities
-@effect(on="input", kind="input", name="input saturation", lower=0, upper=WHOLE,
+@effect(on="input", kind="input", name="input saturation", lower=0, upper=MOST_STRENGTH,
         shapes={"c": sizes(0.5, 0.75, 0.9, between=(0.1, 0.99))})  # fmt: skip
 def input_saturation(u, strength, c):
     """u - l (u - clip(u, -c, c))"""
     return u - strength * (u - np.clip(u, -c, c))
 
 
-@effect(on="input", kind="input", name="dead zone", lower=0, upper=WHOLE,
+@effect(on="input", kind="input", name="dead zone", lower=0, upper=MOST_STRENGTH,
         shapes={"c": sizes(0.1, 0.25, 0.5, between=(0.01, 0.9))})  # fmt: skip
 def dead_zone(u, strength, c):
     """u - l clip(u, -c, c)"""
@@ -68,7 +68,7 @@ def backlash(u, held, strength, c):
     return Auxiliary(u + strength * (follows - u), {"held": Dirac(follows)}, {"held": Dirac(u)})
 
 
-@effect(on="input", kind="state", name="input delay", lower=0, upper=WHOLE,
+@effect(on="input", kind="state", name="input delay", lower=0, upper=MOST_STRENGTH,
         states={"past": "delay"}, common=True,
         shapes={"delay": numbers(1, 2, 4), "before": BEFORE})  # fmt: skip
 def input_delay(u, past, strength, delay, before):

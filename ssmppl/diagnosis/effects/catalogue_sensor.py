@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from ssmppl.diagnosis.effects.effect import (
-    WHOLE,
+    MOST_STRENGTH,
     Auxiliary,
     declared,
     effect,
@@ -61,21 +61,21 @@ def saturating_gain(h, strength, s, middle):
 
 
 @effect(on="channel", kind="observation", name="sensor clipping", form="upper", lower=0,
-        upper=WHOLE, shapes={"c": quantiles(0.8, 0.95, between=(0.5, 0.99))})  # fmt: skip
+        upper=MOST_STRENGTH, shapes={"c": quantiles(0.8, 0.95, between=(0.5, 0.99))})  # fmt: skip
 def upper_clipping(h, strength, c):
     """-l max(h - c, 0)"""
     return -strength * np.maximum(h - c, 0.0)
 
 
 @effect(on="channel", kind="observation", name="sensor clipping", form="lower", lower=0,
-        upper=WHOLE, shapes={"c": quantiles(0.2, 0.05, between=(0.01, 0.5))})  # fmt: skip
+        upper=MOST_STRENGTH, shapes={"c": quantiles(0.2, 0.05, between=(0.01, 0.5))})  # fmt: skip
 def lower_clipping(h, strength, c):
     """l max(c - h, 0)"""
     return strength * np.maximum(c - h, 0.0)
 
 
 @effect(on="channel", kind="observation", name="sensor clipping", form="both ends", lower=0,
-        upper=WHOLE,
+        upper=MOST_STRENGTH,
         shapes={"c": sds(1.0, 1.5, between=(0.3, 2.5)), "middle": means(1.0)})  # fmt: skip
 def both_clippings(h, strength, c, middle):
     """-l (h - clip(h, m - c, m + c)), m the middle of the range"""
@@ -97,7 +97,7 @@ def sensor_lag(h, sensed, strength, k, start):
                      {"sensed": Dirac(start)})  # fmt: skip
 
 
-@effect(on="channel", kind="state", name="sensor delay", lower=0, upper=WHOLE,
+@effect(on="channel", kind="state", name="sensor delay", lower=0, upper=MOST_STRENGTH,
         states={"earlier": "delay"},
         shapes={"delay": numbers(1, 3), "start": firsts(1.0)})  # fmt: skip
 def sensor_delay(h, earlier, strength, delay, start):
@@ -107,7 +107,7 @@ def sensor_delay(h, earlier, strength, delay, start):
                      {"earlier": Dirac(np.full(int(delay), start))})  # fmt: skip
 
 
-@effect(on="channel", kind="observation", name="quantisation", lower=0, upper=WHOLE,
+@effect(on="channel", kind="observation", name="quantisation", lower=0, upper=MOST_STRENGTH,
         requires="additive", shapes={"d": sds(0.25, 0.5, 1.0)})  # fmt: skip
 def quantisation(h, strength, d):
     """l (round(h / d) d - h)"""

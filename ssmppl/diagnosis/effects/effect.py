@@ -76,7 +76,7 @@ Bounds = tuple[float, float] | None
 # The most strength of an effect that is whole at 1. Beyond, a delay extrapolates, so that one of 2
 # rows at twice the strength passes for one of 4, and a limit folds what exceeds it back: pulses in
 # the few highest rows. What is over leaves an estimate near 1 its error.
-WHOLE = 1.25
+MOST_STRENGTH = 1.25
 
 # The words of a declaration: see the tables above.
 KINDS = ("transition", "observation", "input", "noise", "tail", "parameter", "initial", "state")

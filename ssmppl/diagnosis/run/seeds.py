@@ -37,9 +37,9 @@ class Choice(IntEnum):
     CHOSEN_SHAPES = 8
     SIMULATION = 9  # predictions further ahead of the model as it is
     EXPLAINED = 10  # whether a cause explains what gained more
-    OTHER_END = 13  # lags and delays of inputs for those of a sensor, and the other way round
     BACKWARD = 12  # without an effect that came before others
     OVERLOOKED = 11  # mechanisms that a screen at a strength of zero does not see
+    OTHER_END = 13  # lags and delays of inputs for those of a sensor, and the other way round
 
 
 class Task(IntEnum):

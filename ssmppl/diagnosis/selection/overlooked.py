@@ -6,7 +6,7 @@ stands in for, or a stop, beyond which the simulated sets go and the data never 
 only describes a misfit gains most, the mechanisms of the same equation are fitted too, each from
 the best of a few strengths and shapes: those of the screen, and others all over the range of each,
 as a stop that is touched twice lies further out than the screen looks. The range of each sensor is
-looked at whatever leads.
+looked at whatever leads, but for a model that calls a simulator.
 """
 
 from __future__ import annotations
@@ -64,8 +64,10 @@ def overlooked(screen: Screen, refits: Sequence[Refit], worth: float) -> list[li
     if not refits or (best := preferred(refits, worth)[0]).penalised_gain < worth:
         return []
     c, done = best.candidates[0], {int(screen.groups[r.index[0]]) for r in refits}
-    places = set() if c.effect.cause == MECHANISM else _equations(c, screen.design.trace)
-    out = []
+    known, trace = c.effect.cause == MECHANISM, screen.design.trace
+    if known and simulators(trace):  # each likelihood takes long
+        return []
+    places, out = set() if known else _equations(c, trace), []
     for head in screen.family.leaders:
         group, c = int(screen.groups[head]), screen.design.candidates[head]
         if not (_acts(c, places) or c.effect in RANGES):

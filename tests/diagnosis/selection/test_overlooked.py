@@ -48,6 +48,19 @@ def mass():
     return model
 
 
+def screened(u, y, effects):
+    """The mass fitted to a record, and its screen: augmented models, fit, screen, experiments."""
+    problem = pose(mass(), {"u": u, "y": y})
+    train, missing = problem.experiments, missing_of(problem.experiments)
+    augmented = AugmentedModels(problem.trace, missing, {}, Settings())
+    base = augmented.base_fitter.fit(train, seed_sequence(1), {})
+    states = augmented.base_fitter.states(train[0], base.theta, random_state(seed_sequence(2)))
+    scales = Scales.of(problem.trace, states, train[0].y, train[0].u, LONG)
+    design = ScreenDesign(problem.trace, scales, missing, (), Settings(), effects)
+    screen = run_screen(design, train, base.theta, 60, seed_sequence(3), Checkpoint(None, {}))
+    return augmented, base, screen, train
+
+
 @pytest.fixture(scope="module")
 def stopped():
     """A mass on a spring that hits an inelastic stop on one side."""
@@ -61,15 +74,7 @@ def stopped():
             v += SHORT / 25 * (u[k] - 0.4 * v - x - (60.0 * beyond + 4.0 * v * (beyond > 0.0)))
             x += SHORT / 25 * v
         v += 0.01 * rng.standard_normal()
-    problem = pose(mass(), {"u": u, "y": y})
-    train, missing = problem.experiments, missing_of(problem.experiments)
-    augmented = AugmentedModels(problem.trace, missing, {}, Settings())
-    base = augmented.base_fitter.fit(train, seed_sequence(1), {})
-    states = augmented.base_fitter.states(train[0], base.theta, random_state(seed_sequence(2)))
-    scales = Scales.of(problem.trace, states, train[0].y, train[0].u, LONG)
-    design = ScreenDesign(problem.trace, scales, missing, (), Settings(), EFFECTS)
-    screen = run_screen(design, train, base.theta, 60, seed_sequence(3), Checkpoint(None, {}))
-    return augmented, base, screen, train
+    return screened(u, y, EFFECTS)
 
 
 def column(screen, effect, equation, form=""):
@@ -208,16 +213,8 @@ def clipped():
     for k in range(LONG):
         y[k] = min(x, 0.8) + 0.003 * rng.standard_normal()
         x, v = x + SHORT * v, v + SHORT * (u[k] - 0.4 * v - x) + 0.01 * rng.standard_normal()
-    problem = pose(mass(), {"u": u, "y": y})
-    train, missing = problem.experiments, missing_of(problem.experiments)
-    augmented = AugmentedModels(problem.trace, missing, {}, Settings())
-    base = augmented.base_fitter.fit(train, seed_sequence(1), {})
-    states = augmented.base_fitter.states(train[0], base.theta, random_state(seed_sequence(2)))
-    scales = Scales.of(problem.trace, states, train[0].y, train[0].u, LONG)
     effects = ["sensor clipping", "sensor gain nonlinearity", "missing input", "quadratic drag"]
-    design = ScreenDesign(problem.trace, scales, missing, (), Settings(), effects)
-    screen = run_screen(design, train, base.theta, 60, seed_sequence(3), Checkpoint(None, {}))
-    return augmented, base, screen, train
+    return screened(u, y, effects)
 
 
 def test_the_range_of_a_sensor_is_looked_at_whatever_leads(clipped):
