@@ -437,10 +437,10 @@ def refit_all(
     """The refits that came to an end, best first, and why the others did not. afresh, approximate :
     as of `refit`. begins : of each set, of one effect. simulation : of the model as it is, for
     `Refit.ahead`; None: that is 0."""
-    index = sorted({k for s in sets for k in s})
-    shaped = {k: screen.design.candidates[k] for k in index}
+    columns = sorted({k for s in sets for k in s})
+    shaped = {k: screen.design.candidates[k] for k in columns}
     if begins is None:  # else the lengths are given
-        shaped = _shaped(augmented.fitter(tuple(given)), base, screen, index, train, seed)
+        shaped = _shaped(augmented.fitter(tuple(given)), base, screen, columns, train, seed)
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
     if begins is not None:
         added = [(*a[:-1], a[-1].with_shape(**b.shape)) for a, b in zip(added, begins, strict=True)]

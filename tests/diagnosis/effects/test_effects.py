@@ -370,3 +370,13 @@ def test_names_restrict_effects_add_and_a_mapping_renames():
 def test_a_mixture_is_not_told_to_have_a_variance_that_follows_from_its_mean():
     law = ssm.Mixture([0.5, 0.5], [ssm.Normal(0, sd=1), ssm.Normal(0, sd=9)])
     assert "no argument is known to be its spread" in str(has_scale(law))
+
+
+def test_a_sensor_that_saturates_shows_all_in_the_middle_and_no_more_than_its_range():
+    """With the whole strength: a reading within m - s and m + s, of slope 1 at m."""
+    (saturating,) = [e for e in effects.get("sensor gain nonlinearity") if e.form == "saturating"]
+    h, (s, middle) = np.array([-50.0, 2.999, 3.0, 3.001, 60.0]), (2.0, 3.0)
+    reading = h + saturating.function(h, 1.0, s, middle)
+    assert reading[[0, 2, 4]] == pytest.approx([middle - s, middle, middle + s])
+    assert np.diff(reading)[1:3] == pytest.approx(np.diff(h)[1:3], rel=1e-5)
+    assert h + saturating.function(h, 0.0, s, middle) == pytest.approx(h)
