@@ -319,7 +319,7 @@ class _Diagnosis:
         whole = None if self.split or (r.selection and r.selection.rebased) else r.screen
         return CrossValidation(
             augmented, design, base, self.experiments, self.alpha, r.chosen, whole, r.simulator,
-            self.horizon,
+            self.horizon, r.searched,
         ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)  # fmt: skip
 
     def _separating_experiment(self, r: Results) -> None:

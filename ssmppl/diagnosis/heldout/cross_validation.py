@@ -33,7 +33,7 @@ from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen, screen_part
 from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
-from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.diagnosis.selection.refit import Begin, Refit
 from ssmppl.errors import ArgumentError, SSMError
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.inference.verbs.simulate import feeds_back
@@ -63,7 +63,7 @@ class CrossValidation:
     error rate of the selection. chosen : on all rows; None: the reference stands for it. whole :
     the screen of all rows by that design, whose simulated sets serve all blocks; None: each block
     has its own. simulator : the base model as it is simulated; None: as it was fitted. horizon : as
-    of `HeldOutRows`.
+    of `HeldOutRows`. searched : as of `EffectSelection`, of the effects that are chosen.
     """
 
     augmented: AugmentedModels
@@ -75,6 +75,7 @@ class CrossValidation:
     whole: Screen | None = None
     simulator: tuple[Fitter, Fit] | None = None
     horizon: int | None = None
+    searched: Sequence[tuple[Candidate, Begin]] = ()
 
     def gain(self, label: str, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> HeldOutGain:
         """Share of the gap that is closed on the blocks left out."""
@@ -185,6 +186,7 @@ class CrossValidation:
                 self.augmented, screen, fold.train, seed, self.alpha, checkpoint, always=True,
                 singles=SINGLES_CALLED if called else SINGLES, approximate=True,
                 most=len(self.chosen.candidates), further=not called, horizon=self.horizon,
+                searched=self.searched,
             ).run(found)  # fmt: skip
         chosen = found.chosen
         reference = fit_reference(

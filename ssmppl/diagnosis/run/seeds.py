@@ -39,6 +39,8 @@ class Choice(IntEnum):
     EXPLAINED = 10  # whether a cause explains what gained more
     BACKWARD = 12  # without an effect that came before others
     OVERLOOKED = 11  # mechanisms that a screen at a strength of zero does not see
+    SEARCHED = 14  # what a search found in a larger record
+    SEARCHED_SHAPES = 15
     OTHER_END = 13  # lags and delays of inputs for those of a sensor, and the other way round
 
 

@@ -108,7 +108,9 @@ class EffectSelection:
     best one even where the screen finds nothing. singles : how many are refitted; None: the
     leading ones and what correlates with them. most : effects in all. approximate : by approximate
     fits (`Effort`), without standard errors. further : whether screens run again around what was
-    chosen look for more. horizon : as of `diagnose`.
+    chosen look for more. horizon : as of `diagnose`. searched : candidates, as a
+    screen has them, that only a search at finite strengths found in a larger record, and where
+    their refits began: they begin there here too.
     """
 
     augmented: AugmentedModels
@@ -123,6 +125,7 @@ class EffectSelection:
     approximate: bool = False
     further: bool = True
     horizon: int | None = None
+    searched: Sequence[tuple[Candidate, Begin]] = ()
 
     def run(self, out: SelectionResult) -> None:
         """Refit, choose, and step forward; into `out`, which keeps what came before an error."""
@@ -195,12 +198,29 @@ class EffectSelection:
                 )  # fmt: skip
                 refits = best_of_groups(screen, refits + more)
                 out.notes += [f"not refitted: {reason}" for reason in failed]
+        with self.checkpoint.failures.guard("what a search found"):
+            refits = best_of_groups(screen, refits + self._searched(out))
         if self.singles is None:
             with self.checkpoint.failures.guard("lags and delays at the other end"):
                 refits = best_of_groups(screen, refits + self._at_the_other_end(out, refits))
             with self.checkpoint.failures.guard("mechanisms that the screen overlooks"):
                 refits = best_of_groups(screen, refits + self._overlooked(out, refits))
         out.refits = refits
+
+    def _searched(self, out: SelectionResult) -> list[Refit]:
+        """What a search found in a larger record, refitted; its shapes are estimated at once, as
+        those of the screen may be far from it."""
+        column = {c.key: k for k, c in enumerate(self.screen.design.candidates)}
+        known = [(column[c.key], begin) for c, begin in self.searched if c.key in column]
+        more, failed = self._refit(
+            out, out.base, self.screen, [[k] for k, _ in known], self._seed(Choice.SEARCHED),
+            "refitting what a search found", begins=[begin for _, begin in known],
+        )  # fmt: skip
+        out.notes += [f"not refitted: {reason}" for reason in failed]
+        if not more:
+            return more
+        stage = "estimating shapes of what a search found"
+        return self._shaped(out, more, Choice.SEARCHED_SHAPES, stage)
 
     def _delayed(self, out: SelectionResult, refits: Sequence[Refit]) -> list[int]:
         """The best delay of an input that moving the inputs promises and that was not refitted."""

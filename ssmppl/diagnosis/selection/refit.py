@@ -87,7 +87,8 @@ class Refit:
 
     index : their places among the screen's candidates. gain : nats over the model without them.
     cost : of these, what the choice of their shapes is worth. ahead : nats that predictions more
-    than one row ahead gain (`SimulationGain`). simulating : with the parameters for that.
+    than one row ahead gain (`SimulationGain`). simulating : with the parameters for that. begin :
+    where a search had its fit begin; None: where the score said.
     """
 
     index: tuple[int, ...]
@@ -98,6 +99,7 @@ class Refit:
     cost: float = 0.0
     ahead: float = 0.0
     simulating: SimulationFit | None = None
+    begin: Begin | None = None
 
     @property
     def simulator(self) -> tuple[Fitter, Fit]:
@@ -467,8 +469,9 @@ def refit_all(
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
         cost += PRICE * sum(_of_other_length(screen, k, shaped[k]) for k in index)
-        cost += PRICE * bool(begins is not None and begins[i].shape)
-        made = Refit(tuple(index), candidates, fitter, fit, gain, cost)
+        begin = None if begins is None else begins[i]
+        cost += PRICE * bool(begin is not None and begin.shape)
+        made = Refit(tuple(index), candidates, fitter, fit, gain, cost, begin=begin)
         done.append(made.simulated(train, numbers, simulation))
     done.sort(key=lambda r: -r.score)
     return done, reasons

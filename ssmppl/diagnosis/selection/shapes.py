@@ -94,7 +94,7 @@ def shaped_all(
             moved += np.sum(_estimable(old, scales) != shapes)
             cost = old.cost + PRICE * moved
             gain = fit.log_likelihood - base.log_likelihood
-            new = Refit(old.index, made, fitter, fit, gain, cost)
+            new = Refit(old.index, made, fitter, fit, gain, cost, begin=old.begin)
             new = new.simulated(train, numbers, simulation)
             if new.penalised_gain > old.penalised_gain and new.score > old.score:
                 out[i] = new

@@ -17,7 +17,7 @@ from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.effect_selection import SelectionResult
 from ssmppl.diagnosis.selection.equivalence import Classes, equivalence_classes, group_leaders
-from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.diagnosis.selection.refit import Begin, Refit
 from ssmppl.diagnosis.verdict.verdicts import CURVES
 from ssmppl.language.model.trace import Trace
 
@@ -64,6 +64,13 @@ class Results:
         """The model as it is, with its parameters for simulation."""
         found = self.selection.simulating if self.selection else None
         return found.model if found else (self.base, self.fit)
+
+    @property
+    def searched(self) -> list[tuple[Candidate, Begin]]:
+        """The chosen effects, as the screen has them, whose refits began where a search said."""
+        groups = {c.group for c in self.chosen.candidates} if self.chosen else set()
+        begun = [(self.screen.design.candidates[r.index[0]], r.begin) for r in self.refits]
+        return [(c, begin) for c, begin in begun if begin and c.group in groups]
 
     @property
     def names(self) -> list[str]:
