@@ -43,8 +43,9 @@ def root(P, L):
 
 @cache
 def compiled(step: Callable, observe: Callable) -> Callable:
-    """The filter of one system: run(m, P, V, Y, p, e, counts) -> log density, standardised error
-    and half log variance of each observation, each (T, channels)."""
+    """The filter of one system: run(m, P, V, Y, p, e, counts) -> log density, standardised error,
+    half log variance and prediction of each observation, each (T, channels); the prediction of one
+    that is missing too, by the rows before it and the channels before it in its row."""
 
     @njit
     def run(m, P, V, Y, p, e, counts):
@@ -53,6 +54,7 @@ def compiled(step: Callable, observe: Callable) -> Callable:
         m, P = m.copy(), P.copy()
         L = np.zeros((n, n))
         ll, eps, half = np.zeros((T, channels)), np.zeros((T, channels)), np.zeros((T, channels))
+        predicted = np.zeros((T, channels))
         sd, scrap = np.zeros(n), np.zeros(n)
         f0, up, down, x = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
         before, first, second, C = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
@@ -64,8 +66,6 @@ def compiled(step: Callable, observe: Callable) -> Callable:
         c = np.sqrt(SPREAD**2 - 1) * b
         for t in range(T):
             for j in range(channels):
-                if np.isnan(Y[t, j]):
-                    continue
                 root(P, L)
                 wild[:] = 0
                 observe(m, V[t], t + 1, p, e, y0, r, wild)
@@ -85,6 +85,9 @@ def compiled(step: Callable, observe: Callable) -> Callable:
                     S += d1 * d1 + c * c * d2 * d2
                     for i in range(n):
                         C[i] += d1 * L[i, k]
+                predicted[t, j] = mean
+                if np.isnan(Y[t, j]):
+                    continue
                 R = mean if counts else r[j] * r[j]
                 if counts and R < 1e-3:
                     R = 1e-3
@@ -135,7 +138,7 @@ def compiled(step: Callable, observe: Callable) -> Callable:
             m[:] = x
             for i in range(n):
                 P[i, i] += sd[i] * sd[i]
-        return ll, eps, half
+        return ll, eps, half, predicted
 
     return run
 
@@ -144,6 +147,19 @@ def terms(
     system: System, p: np.ndarray, e: np.ndarray, U: np.ndarray, Y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log density, standardised one-step error and half log variance of each Y, (T, channels)."""
+    return _filtered(system, p, e, U, Y)[:3]
+
+
+def predictions(
+    system: System, p: np.ndarray, e: np.ndarray, U: np.ndarray, Y: np.ndarray
+) -> np.ndarray:
+    """(T, channels) means of the observations, missing ones among them, by those before them."""
+    return _filtered(system, p, e, U, Y)[3]
+
+
+def _filtered(
+    system: System, p: np.ndarray, e: np.ndarray, U: np.ndarray, Y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     first = np.array(system.start)
     V = np.ascontiguousarray(driven(U, e))
     run = compiled(system.step, system.observe)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +26,7 @@ import pandas as pd
 
 import ssmppl as ssm
 from bench.gap.filter import terms
-from bench.gap.fit import fit
+from bench.gap.fit import Fitted, fit
 from bench.gap.plan import CELLS, SPLIT, entries
 from bench.gap.records import CACHE, Record
 from bench.gap.run import SETS
@@ -59,10 +59,7 @@ def through(model: Model, parameters: dict[str, float]) -> Rows:
 
 def reference(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Rows:
     """The same of the true model, refitted to the first 70% of a set's rows."""
-    keys = tuple(e["key"] for e in answer["effects"])
-    strengths = {e["key"]: e["strength"] for e in answer["effects"]}
-    p = parameters(system, answer)
-    found = fit(system, U, Y, keys, p, system.strengths(strengths), int(CONFIRM * len(Y)))
+    found = refitted(system, answer, U, Y)
 
     def rows(data: pd.DataFrame, repeats: int) -> np.ndarray:
         U, Y = arrays(system, data)
@@ -70,6 +67,14 @@ def reference(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Row
         return np.repeat(ll[None], repeats, axis=0)
 
     return rows
+
+
+def refitted(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Fitted:
+    """The true model's parameters and strengths by the first 70% of a set's rows."""
+    keys = tuple(e["key"] for e in answer["effects"])
+    strengths = {e["key"]: e["strength"] for e in answer["effects"]}
+    p = parameters(system, answer)
+    return fit(system, U, Y, keys, p, system.strengths(strengths), int(CONFIRM * len(Y)))
 
 
 def parameters(system: System, answer: dict) -> np.ndarray:
@@ -89,20 +94,8 @@ def share(
     cut = int(CONFIRM * len(data))
     parts = [rows(data, REPEATS)[:, cut:] for rows in (base, effect, true)]
     found = gain_ratio(*parts)
-    p = parameters(system, answer)
-    e = system.strengths({x["key"]: x["strength"] for x in answer["effects"]})
-    excited, _ = arrays(system, data)
-    if system.control is not None:  # the same references: the commands are each run's own
-        again = np.random.default_rng(answer["seed"])
-        system.drawn_parameters(again)
-        excited = system.excite(again, len(data))
     total = np.zeros(2)
-    for k in range(RUNS):
-        rng = np.random.default_rng([answer["seed"], 1 + k])
-        U, _, Y = system.recorded(p, e, excited, rng)
-        fresh = data.copy()
-        fresh[list(system.inputs)] = U
-        fresh[list(system.channels)] = Y
+    for fresh in fresh_runs(system, answer, data):
         l0, lk, lc = (rows(fresh, 1)[0, cut:].sum() for rows in (base, effect, true))
         total += lk - l0, lc - l0
     return {
@@ -113,27 +106,50 @@ def share(
     }
 
 
+def fresh_runs(system: System, answer: dict, data: pd.DataFrame) -> Iterator[pd.DataFrame]:
+    """Tables like `data` of `RUNS` further runs of the true system."""
+    p = parameters(system, answer)
+    e = system.strengths({x["key"]: x["strength"] for x in answer["effects"]})
+    excited, _ = arrays(system, data)
+    if system.control is not None:  # the same references: the commands are each run's own
+        again = np.random.default_rng(answer["seed"])
+        system.drawn_parameters(again)
+        excited = system.excite(again, len(data))
+    for k in range(RUNS):
+        rng = np.random.default_rng([answer["seed"], 1 + k])
+        U, _, Y = system.recorded(p, e, excited, rng)
+        fresh = data.copy()
+        fresh[list(system.inputs)] = U
+        fresh[list(system.channels)] = Y
+        yield fresh
+
+
+def estimated(record: Record, when: str) -> dict[str, float]:
+    """The parameters of the model "before" or "after" the diagnosis."""
+    return {name: pair[0] for name, pair in record.estimates[when].items()}
+
+
+def handed_back(record: Record) -> Model:
+    """The model with the chosen effects that a diagnosis handed back."""
+    with TemporaryDirectory() as scratch:
+        path = Path(scratch) / f"augmented_{record.id}.py"
+        path.write_text(record.model_text)
+        return load_model(str(path))
+
+
 def of_record(record: Record, answer: dict) -> dict[str, float]:
     """F and F* of the model that a diagnosis handed back."""
     folder = SETS / record.id
     data = pd.read_csv(folder / "data.csv")
     system = SYSTEMS[answer["system"]]
-    with TemporaryDirectory() as scratch:
-        path = Path(scratch) / f"augmented_{record.id}.py"
-        path.write_text(record.model_text)
-        augmented = load_model(str(path))
-        before, after = (
-            {name: pair[0] for name, pair in record.estimates[when].items()}
-            for when in ("before", "after")
-        )
-        return share(
-            through(load_model(str(folder / "model.py")), before),
-            through(augmented, after),
-            reference(system, answer, *arrays(system, data)),
-            system,
-            answer,
-            data,
-        )
+    return share(
+        through(load_model(str(folder / "model.py")), estimated(record, "before")),
+        through(handed_back(record), estimated(record, "after")),
+        reference(system, answer, *arrays(system, data)),
+        system,
+        answer,
+        data,
+    )
 
 
 def main() -> None:

@@ -161,10 +161,14 @@ def median(measure: str, method: str, values: Iterable[float], target: str) -> R
     return Row(measure, method, float(np.median(finite)), float(low), float(high), n, n, target)
 
 
-Shares = dict[str, dict[str, float]]  # id -> F, low, high, F_star, as fresh.py writes them
+SIMULATES = 1.2  # times the true model's error
+Shares = dict[str, dict[str, float]]  # id -> numbers, as fresh.py and simulated.py write them
 
 
-def measures(method: str, scored: Sequence[Scored], fresh: Shares | None = None) -> list[Row]:
+def measures(
+    method: str, scored: Sequence[Scored], fresh: Shares | None = None,
+    simulated: Shares | None = None,
+) -> list[Row]:  # fmt: skip
     """All rows of one method."""
 
     def of(*cells: str) -> list[Scored]:
@@ -208,6 +212,13 @@ def measures(method: str, scored: Sequence[Scored], fresh: Shares | None = None)
         median("F of a wrong one, 20 nats", method,
                (s.share(False) for s in of("one-20")), "<= 0.05"),
         rate("interval covers F*", method, covers(ones, fresh or {}), "in 0.90-0.98"),
+        rate(
+            "simulates within 1.2 of the true model, class right",
+            method,
+            (simulated[s.record.id]["after"] <= SIMULATES for s in ones
+             if simulated and s.right_class and s.record.id in simulated),
+            ">= 0.80",
+        ),
         rate("right effect first, arm", method, (s.right_first for s in of("arm")), ""),
         rate("its class first, arm", method, (s.right_class for s in of("arm")), ""),
         rate("right equation, arm", method, (s.right_equation for s in of("arm")), ""),
@@ -326,8 +337,10 @@ def main() -> None:
         for e in entries()
         if options.half in (None, e.half) and (options.subset is None or e.ci)
     ]
-    path = CACHE / "fresh.json"
-    fresh = json.loads(path.read_text()) if path.exists() else {}
+    fresh, simulated = (
+        json.loads(path.read_text()) if (path := CACHE / name).exists() else {}
+        for name in ("fresh.json", "simulated.json")
+    )
     rows: list[Row] = []
     systems: list[str] = []
     for method in options.methods:
@@ -335,7 +348,7 @@ def main() -> None:
         answers = opened(kept)
         print(f"{method}: {len(kept)} of {len(ids)} sets run")
         scored = [Scored(record, answers[id]) for id, record in kept.items()]
-        rows += measures(method, scored, fresh.get(method, {}))
+        rows += measures(method, scored, fresh.get(method, {}), simulated.get(method, {}))
         systems.append(f"\n{method}\n\n{by_system(scored)}")
     print(table(rows, options.methods))
     if options.systems:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from bench.gap.filter import terms
+from bench.gap.filter import predictions, terms
 from bench.gap.fit import fit
 from bench.gap.run import MODELS
 from bench.gap.strength import next_log_strength
@@ -43,6 +43,11 @@ def test_missing_observations_are_left_out():
     ll, _, _ = terms(system, p, e, U, Y)
     assert ll.sum() == pytest.approx(exact, rel=1e-9)
     assert not ll[10:15, 0].any()
+    filtered = ssm.kalman_filter(model, data, dict(zip(system.parameters, p, strict=True)))
+    means = predictions(system, p, e, U, Y)
+    for j, channel in enumerate(system.channels[:1]):  # the others know those before them
+        exact = filtered[f"{channel}_predicted"].values[0]
+        np.testing.assert_allclose(means[:, j], exact, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.slow

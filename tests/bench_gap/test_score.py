@@ -24,8 +24,8 @@ def scored(cell, *effects, **what):
     )
 
 
-def values(*all_scored, fresh=None):
-    return {row.measure: row for row in measures("diagnose", all_scored, fresh)}
+def values(*all_scored, fresh=None, simulated=None):
+    return {row.measure: row for row in measures("diagnose", all_scored, fresh, simulated)}
 
 
 def test_the_interval_is_that_of_clopper_and_pearson():
@@ -141,6 +141,17 @@ def test_coverage_is_of_the_fresh_ratio():
     assert found["F of the true effect, 20 nats"].value == 0.85
     assert values(*sets, fresh={"t000": {**row, "F_star": 1.2}})["interval covers F*"].value == 0
     assert values(*sets)["interval covers F*"].sets == 0
+
+
+def test_simulations_count_where_the_class_is_right():
+    right = scored("one-20", RIGHT, causes=CAUSES, chosen=["quadratic drag"])
+    wrong = scored("one-20", ("dead zone", "u"), causes=CAUSES, chosen=["quadratic drag"])
+    measure = "simulates within 1.2 of the true model, class right"
+    for ratio, hits in ((1.2, 1), (1.21, 0)):
+        found = values(right, simulated={"t000": {"before": 3.0, "after": ratio}})[measure]
+        assert (found.hits, found.sets) == (hits, 1)
+    assert values(wrong, simulated={"t000": {"before": 3.0, "after": 1.0}})[measure].sets == 0
+    assert values(right)[measure].sets == 0
 
 
 def test_a_failure_counts_as_wrong():

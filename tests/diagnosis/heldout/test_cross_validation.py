@@ -44,15 +44,13 @@ def logged():
         air = min(x, MOST) + 0.1 * rng.standard_normal()
         rows.append((valve, outside, air))
         x += 0.09 * (outside - x) + 2.3 * valve + 0.03 * rng.standard_normal()
-    return {n: np.array(v) for n, v in zip(("valve", "outside", "air"), zip(*rows), strict=True)}
+    return dict(zip(("valve", "outside", "air"), np.array(rows).T, strict=True))
 
 
 @pytest.mark.slow
 def test_a_range_that_a_filter_follows_is_found_without_each_block():
     """Its score says nothing: the whole record's search finds it, and so have the blocks to."""
-    found = ssm.diagnose(
-        greenhouse(), logged(), effects=NAMES, mode="full", seed=1, progress=False
-    )
+    found = ssm.diagnose(greenhouse(), logged(), effects=NAMES, mode="full", seed=1, progress=False)
     assert found.chosen == ["sensor clipping"]
     (windows,) = (row for _, row in found.closed.iterrows() if row["horizon"].startswith("1 to"))
     assert windows["low"] > 0.5
