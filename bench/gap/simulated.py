@@ -3,81 +3,102 @@
     python -m bench.gap.simulated [--half sealed] [--cell one-20] [--method diagnose]
 
 Both are fitted to the first 70% of the rows: the report's model by the diagnosis, the true one by
-`fresh.reference`. On fresh runs of the true system (`fresh.fresh_runs`) the last 30% of the rows
-are cut into windows, of which every other one is not shown to the filters: each row in it is
-predicted from the rows before the window, and the inputs. Twice, so that each window is predicted
-once. The errors' mean squares, each channel in its standard deviations, over all runs: the ratio of
-their roots is kept, of the model before the diagnosis too. Opens the answers; sets whose class is
-not right, or that are not of one effect, are left out.
+`fresh.refitted`. On fresh runs of the true system (`fresh.fresh_runs`) the last 30% of the rows are
+cut into windows, each predicted from the rows before it and the inputs: of the true model by its
+filter, to which the window is not shown; of the others by simulations from their filtered states,
+as the tool itself does. The errors' mean squares, each channel in its standard deviations, over all
+runs: the ratio of their roots is kept, of the model before the diagnosis too. Opens the answers;
+sets whose class is not right, or that are not of one effect, are left out.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 
-import ssmppl as ssm
 from bench.gap.filter import predictions
-from bench.gap.fresh import (
-    CONFIRM,
-    arrays,
-    estimated,
-    fresh_runs,
-    handed_back,
-    refitted,
-)
+from bench.gap.fresh import CONFIRM, arrays, estimated, fresh_runs, handed_back, refitted
 from bench.gap.plan import CELLS, SPLIT, entries
 from bench.gap.records import CACHE, Record
 from bench.gap.run import SETS
 from bench.gap.score import Scored, opened, records
 from bench.gap.truth import SYSTEMS, System
+from ssmppl.diagnosis.diagnose import PARTICLES, TWISTED_PARTICLES
+from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, proposal_of
+from ssmppl.diagnosis.model.smoothing import Settings, samples_ahead
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.inference.verbs.simulate import feeds_back
 from ssmppl.language.model.model import Model
 from ssmppl.modelfile import load_model
 
-PARTICLES = 200  # of which the mean adds at most 0.3% to an error
 WINDOW = 50  # rows; of shorter records a quarter of the rows that are predicted
+DRAWS = 512  # simulations from each filtered state: their mean adds 0.1% to an error
 
-Means = Callable[[pd.DataFrame], np.ndarray]  # data -> (T, channels), of missing rows too
+# Data, and windows as (first row, row behind the last) -> (T, channels) means, NaN outside.
+Means = Callable[[pd.DataFrame, Sequence[tuple[int, int]]], np.ndarray]
 
 
-def through(model: Model, parameters: dict[str, float], channels: Sequence[str]) -> Means:
-    """Predictions of a model by its particle filter."""
+def simulating(model: Model, parameters: Mapping[str, float], channels: Sequence[str]) -> Means:
+    """Simulations of a model from its filtered states."""
 
-    def means(data: pd.DataFrame) -> np.ndarray:
-        found = ssm.particle_filter(model, data, parameters, particles=PARTICLES, seed=1)
-        assert not isinstance(found, list)  # one experiment, one Dataset
-        return np.stack([found[f"{c}_predicted"].values[0] for c in channels], axis=-1)
+    def means(data: pd.DataFrame, windows: Sequence[tuple[int, int]]) -> np.ndarray:
+        problem = pose(model, data)
+        proposal = proposal_of(problem.program)
+        number = (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)["full"]
+        e, trace = problem.experiments[0], problem.trace
+        missing = missing_of(problem.experiments)
+        fitter = AugmentedModels(trace, missing, {}, Settings(number, proposal)).base_fitter
+        given = {n: np.asarray(v) for n, v in parameters.items()}
+        theta = space_of(fitter.problem, fitter.fixed, given).theta
+        stream = random_state(seed_sequence(1))
+        filtered = fitter.smoother.filtered_draws(e, theta, stream)
+        origins = np.array([first - 1 for first, _ in windows])
+        reach = max(last - first for first, last in windows)
+        drawn = samples_ahead(
+            fitter.smoother.program, e, theta, *filtered, stream, feeds_back(trace), origins,
+            reach, DRAWS, np.arange(reach),
+        )  # fmt: skip
+        out = np.full((len(data), len(channels)), np.nan)
+        for (first, last), samples in zip(windows, drawn, strict=True):
+            out[first:last] = samples[: last - first].mean(axis=-1)
+        return out
 
     return means
 
 
 def true_model(system: System, answer: dict, data: pd.DataFrame) -> Means:
-    """The same of the true model, refitted to the rows before the last 30%."""
+    """Predictions of the true model, refitted to the rows before the last 30%."""
     found = refitted(system, answer, *arrays(system, data))
-    return lambda shown: predictions(system, found.p, found.e, *arrays(system, shown))
+
+    def means(data: pd.DataFrame, windows: Sequence[tuple[int, int]]) -> np.ndarray:
+        U, Y = arrays(system, data)
+        out = np.full(Y.shape, np.nan)
+        for first, last in windows:
+            shown = Y[:last].copy()
+            shown[first:] = np.nan
+            out[first:last] = predictions(system, found.p, found.e, U[:last], shown)[first:]
+        return out
+
+    return means
 
 
-def windows(rows: int) -> list[np.ndarray]:
-    """Two masks (rows,): the windows that are predicted in the first and in the second pass."""
+def windows_of(rows: int) -> list[tuple[int, int]]:
+    """The windows of the last 30% of so many rows; the last may be shorter."""
     cut = int(CONFIRM * rows)
     width = min(WINDOW, max((rows - cut) // 4, 1))
-    number = np.maximum(np.arange(rows) - cut, -1) // width
-    return [(number >= 0) & (number % 2 == k) for k in range(2)]
+    return [(first, min(first + width, rows)) for first in range(cut, rows, width)]
 
 
 def squares(means: Means, system: System, data: pd.DataFrame, scale: np.ndarray) -> float:
     """Sum of the squared errors in all windows of one run."""
-    channels, total = list(system.channels), 0.0
-    for hidden in windows(len(data)):
-        shown = data.copy()
-        shown.loc[hidden, channels] = np.nan
-        error = (data[channels].to_numpy(float) - means(shown))[hidden] / scale
-        total += float(np.nansum(error**2))
-    return total
+    _, Y = arrays(system, data)
+    return float(np.nansum(((Y - means(data, windows_of(len(Y)))) / scale) ** 2))
 
 
 def of_record(record: Record, answer: dict) -> dict[str, float]:
@@ -89,8 +110,8 @@ def of_record(record: Record, answer: dict) -> dict[str, float]:
     before = load_model(str(folder / "model.py"))
     models = {
         "true": true_model(system, answer, data),
-        "before": through(before, estimated(record, "before"), channels),
-        "after": through(handed_back(record), estimated(record, "after"), channels),
+        "before": simulating(before, estimated(record, "before"), channels),
+        "after": simulating(handed_back(record), estimated(record, "after"), channels),
     }
     scale = np.nanstd(arrays(system, data)[1], axis=0)
     total = dict.fromkeys(models, 0.0)

@@ -274,7 +274,7 @@ class _Diagnosis:
                 drop_by_later_rows(found, self.split, seed, self.checkpoint)
                 held_out = HeldOutTest(
                     (r.base, r.fit), r.simulator, self.split, self.horizon,
-                    self._seed(Stage.HELD_OUT),
+                    self._seed(Stage.HELD_OUT), self.checkpoint.executor,
                 )  # fmt: skip
                 drop_by_held_out_rows(found, held_out, seed, self.checkpoint)
         if found.chosen is not None:

@@ -57,10 +57,7 @@ class ExprArray(np.ndarray):
         __rmatmul__ = __lt__ = __le__ = __gt__ = __ge__ = _any_operator  # type: ignore[assignment]
 
     def __reduce__(self):  # its nodes in one table, shared parts once
-        nodes = [as_expr(e) for e in self.view(np.ndarray).ravel()]
-        table = pack(nodes)
-        place = {node: i for i, node in enumerate(unpack(table))}
-        return _unpack_array, (table, [place[n] for n in nodes], self.shape)
+        return _unpack_array, (*pack(nodes_of(self)), self.shape)
 
 
 def _by_function(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -78,9 +75,19 @@ for _function in (
     setattr(ExprArray, _function.__name__, _by_function(_function))
 
 
+def nodes_of(a: ExprArray) -> list[Expr]:
+    """Its elements in a row."""
+    return [as_expr(e) for e in a.view(np.ndarray).ravel()]
+
+
+def of_nodes(nodes: Sequence[Expr], shape: tuple[int, ...]) -> ExprArray:
+    """The array of this shape whose elements in a row are `nodes`."""
+    return array(array(nodes).reshape(shape))
+
+
 def _unpack_array(table: list, places: list[int], shape: tuple[int, ...]) -> ExprArray:
     nodes = unpack(table)
-    return array(array([nodes[i] for i in places]).reshape(shape))
+    return of_nodes([nodes[i] for i in places], shape)
 
 
 def array(values: Any) -> ExprArray:

@@ -285,17 +285,22 @@ def topological(
     return order
 
 
-def pack(roots: Iterable[Expr]) -> list[tuple[str, tuple[int, ...], Any]]:
-    """Every node under `roots` as (operation, places of its arguments in this list, data)."""
+Table = list[tuple[str, tuple[int, ...], Any]]
+
+
+def pack(roots: Iterable[Expr]) -> tuple[Table, list[int]]:
+    """Every node under `roots` as (operation, places of its arguments in this list, data), and the
+    places of the roots."""
     place: dict[Expr, int] = {}
-    table: list[tuple[str, tuple[int, ...], Any]] = []
+    table: Table = []
+    roots = list(roots)
     for node in topological(roots):
         place[node] = len(table)
         table.append((node.op, tuple(place[a] for a in node.args), node.data))
-    return table
+    return table, [place[r] for r in roots]
 
 
-def unpack(table: list[tuple[str, tuple[int, ...], Any]]) -> list[Expr]:
+def unpack(table: Table) -> list[Expr]:
     """The nodes of a table made by `pack`, interned."""
     nodes: list[Expr] = []
     for op, args, data in table:
@@ -303,14 +308,14 @@ def unpack(table: list[tuple[str, tuple[int, ...], Any]]) -> list[Expr]:
     return nodes
 
 
-def unpack_one(table: list[tuple[str, tuple[int, ...], Any]]) -> Expr:
+def unpack_one(table: Table) -> Expr:
     """The last node of a table: the root it was made for."""
     return unpack(table)[-1]
 
 
 def _reduced(node: Expr) -> tuple[Callable[..., Expr], tuple[Any, ...]]:
     """For pickling: as a flat table, for graphs deeper than Python's recursion limit."""
-    return unpack_one, (pack([node]),)
+    return unpack_one, (pack([node])[0],)
 
 
 behaviour["pickle"] = _reduced

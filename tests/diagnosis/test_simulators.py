@@ -191,7 +191,7 @@ def test_what_only_particles_can_fit_is_not_refitted():
         assert {"outliers in y", "sensor bias in y"} <= set(found)
         if called:
             outliers = [c for c in tried if str(c) == "outliers in v"]
-            refused = refit(augmented, None, None, [0], problem.experiments, None, outliers)
+            refused = refit(augmented, None, [0], outliers, problem.experiments, None, None)
             assert isinstance(refused, NotApplicable)
             assert "outliers in v: only a particle filter" in refused.reason
 

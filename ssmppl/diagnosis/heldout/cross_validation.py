@@ -14,6 +14,7 @@ both sides, and hardly a gap is left.)
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -139,9 +140,9 @@ class CrossValidation:
         models = self._models(fold, seed, checkpoint)
         counts, chosen = list(fold.left_out), models.chosen
         events = [c for c in (chosen.candidates if chosen else ()) if is_dated(c)]
-        found = {"base": predict(*models.base, self.experiments, counts, seed)}
+        found = {"base": predict(*models.base, self.experiments, counts, seed, checkpoint.executor)}
         for name, model in (("effect", models.effect), ("reference", models.reference)):
-            found[name] = self._predict(model, events, fold, seed)
+            found[name] = self._predict(model, events, fold, seed, checkpoint.executor)
         out = {n: p.log_density.sum(axis=1) for n, p in found.items()}
         if not all(np.all(np.isfinite(v)) for v in out.values()):
             raise ArgumentError("zero predictive density for a held-out block")
@@ -202,7 +203,7 @@ class CrossValidation:
 
     def _predict(
         self, model: tuple[Fitter, Fit], events: Sequence[Candidate], fold: Fold,
-        seed: np.random.SeedSequence,
+        seed: np.random.SeedSequence, executor: Executor | None,
     ) -> Predictions:  # fmt: skip
         """One-step predictions of the block, averaged over dates that other rows cannot separate.
 
@@ -219,13 +220,13 @@ class CrossValidation:
                     theta = fit.theta.copy()
                     theta[names.index(own)] = date
                     at = replace(fit, theta=theta)
-                    each.append(predict(fitter, at, self.experiments, counts, seed))
+                    each.append(predict(fitter, at, self.experiments, counts, seed, executor))
                 total = np.stack([p.log_density.sum(axis=1) for p in each])
                 top = total.max(axis=0)
                 density = top + np.log(np.mean(np.exp(total - top), axis=0))
                 mean = np.mean([p.mean for p in each], axis=0)
                 return replace(each[0], log_density=density[:, None], mean=mean)
-        return predict(fitter, fit, self.experiments, counts, seed)
+        return predict(fitter, fit, self.experiments, counts, seed, executor)
 
 
 def indistinguishable_dates(c: Candidate, fold: Fold) -> list[float]:

@@ -8,6 +8,7 @@ several together have to do better than none on the held-out rows, one row ahead
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,7 @@ class HeldOutTest:
 
     base, simulator : the model as it is, by likelihood and as it is simulated. horizon : rows of
     the windows that are simulated; None: a tenth of the longest record. seed : of all held-out
-    rows.
+    rows. executor : for runs of a particle filter.
     """
 
     base: tuple[Fitter, Fit]
@@ -67,10 +68,12 @@ class HeldOutTest:
     split: RowSplit
     horizon: int | None
     seed: np.random.SeedSequence
+    executor: Executor | None = None
 
     def predictions(self, fitter: Fitter, fit: Fit) -> Predictions:
         """One row ahead."""
-        return predict(fitter, fit, self.split.experiments, self.split.held_out, self.seed)
+        experiments, counts = self.split.experiments, self.split.held_out
+        return predict(fitter, fit, experiments, counts, self.seed, self.executor)
 
     def simulated_worse(self, chosen: Refit) -> float:
         """The share by which simulations over windows are further off with the effects than
@@ -125,7 +128,9 @@ def _later(
 
     def numbers() -> Numbers:
         try:
-            value = predicted_later(refit.fitter, refit.fit.by_parameter, split, seed)
+            value = predicted_later(
+                refit.fitter, refit.fit.by_parameter, split, seed, checkpoint.executor
+            )
         except SSMError:
             value = -np.inf
         return {"value": np.asarray(value if np.isfinite(value) else -np.inf)}

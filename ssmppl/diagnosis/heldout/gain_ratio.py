@@ -394,27 +394,30 @@ class HeldOutRows:
         SSMError : a model cannot predict the held-out rows, or there are too few.
         """
         chosen, experiments, counts = self.chosen, self.split.experiments, self.split.held_out
-        plain = predict(*self.base, experiments, counts, seed)
+        over = checkpoint.executor
+        plain = predict(*self.base, experiments, counts, seed, over)
         try:
             reference = fit_reference(
                 self.augmented, chosen.candidates if chosen else (),
                 chosen.fit if chosen else self.base[1], self.screen, self.split.train, seed,
                 checkpoint, self.split,
             )  # fmt: skip
-            best = predict(*reference, experiments, counts, seed)
+            best = predict(*reference, experiments, counts, seed, over)
         except SSMError as error:
             out.notes.append(f"the reference model could not be fitted: {error.found}")
             return
         model = (chosen.fitter, chosen.fit) if chosen else reference
         same = reference[1] is model[1]  # nothing was found beyond the chosen effects
         out.curves = reference[1] is not (chosen.fit if chosen else self.base[1])
-        found = best if same else predict(*model, experiments, counts, seed)
+        found = best if same else predict(*model, experiments, counts, seed, over)
         ratio = gain_ratio(
             plain.log_density, found.log_density, best.log_density, starts=plain.starts
         )
         rival, other = found, self.best_refit
         if chosen is None:
-            rival = predict(other.fitter, other.fit, experiments, counts, seed) if other else plain
+            rival = plain
+            if other is not None:
+                rival = predict(other.fitter, other.fit, experiments, counts, seed, over)
         out.beyond_catalogue = gain_ratio(
             rival.log_density, best.log_density, best.log_density, starts=plain.starts
         ).gain

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -41,30 +43,17 @@ class Predictions:
 
 def predict(
     fitter: Fitter, fit: Fit, experiments: Sequence[Experiment], counts: Sequence[np.ndarray],
-    seed: np.random.SeedSequence, runs: int = RUNS,
+    seed: np.random.SeedSequence, executor: Executor | None = None,
 ) -> Predictions:  # fmt: skip
     """Filter all rows from the first with the fitted parameters, and keep those that count.
 
-    Experiments without any are left out.
+    Experiments without any are left out. executor : for the runs.
     """
-    called = isinstance(fitter.smoother.extended, Extended)  # its increments are of each row
     held = [i for i, c in enumerate(counts) if c.any()] or [0]
     experiments, counts = [experiments[i] for i in held], [counts[i] for i in held]
-
-    def one(r: int) -> list[Pass]:
-        stream = random_state(seed, Stream.PREDICTIONS, r)
-        passes = fitter.smoother.run(experiments, fit.theta, stream)
-        for p in passes:
-            p.log_increments[:1] += fitter.log_correction
-        if fitter.exact or called or fitter.settings.proposal != "twisted":
-            return passes
-        return [
-            replace(p, log_increments=stretches(fitter, fit, e, c, stream))
-            for p, e, c in zip(passes, experiments, counts, strict=True)
-        ]
-
-    repeats = 1 if fitter.exact or called else runs
-    passes = run_tasks(one, range(repeats))
+    repeats = 1 if fitter.exact or _called(fitter) else RUNS
+    one = partial(_one_run, fitter, fit, experiments, counts, seed)
+    passes = run_tasks(one, range(repeats), executor=executor if repeats > 1 else None)
 
     def kept(values: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([v[c] for v, c in zip(values, counts, strict=True)])
@@ -75,15 +64,37 @@ def predict(
     y = kept([np.where(e.seen == 1.0, e.y, np.nan) for e in experiments])
     lengths = [int(c.sum()) for c in counts]
     starts = tuple(np.cumsum([0, *lengths[:-1]]).tolist())
-    if repeats < runs:  # exact: no spread between runs
-        density = np.repeat(density, runs, axis=0)
+    if repeats < RUNS:  # exact: no spread between runs
+        density = np.repeat(density, RUNS, axis=0)
     together = [p.covariance for p in passes[0] if p.covariance is not None]
     covariance = kept(together) if len(together) == len(counts) else None
     return Predictions(density, means.mean(axis=0), spread.mean(axis=0), y, starts, covariance)
 
 
+def _called(fitter: Fitter) -> bool:
+    """Whether its increments are those of a filter that calls a simulator, of each row."""
+    return isinstance(fitter.smoother.extended, Extended)
+
+
+def _one_run(
+    fitter: Fitter, fit: Fit, experiments: Sequence[Experiment], counts: Sequence[np.ndarray],
+    seed: np.random.SeedSequence, r: int,
+) -> list[Pass]:  # fmt: skip
+    stream = random_state(seed, Stream.PREDICTIONS, r)
+    passes = fitter.smoother.run(experiments, fit.theta, stream)
+    for p in passes:
+        p.log_increments[:1] += fitter.log_correction
+    if fitter.exact or _called(fitter) or fitter.settings.proposal != "twisted":
+        return passes
+    return [
+        replace(p, log_increments=stretches(fitter, fit, e, c, stream))
+        for p, e, c in zip(passes, experiments, counts, strict=True)
+    ]
+
+
 def predicted_later(
-    fitter: Fitter, start: Mapping[str, np.ndarray], split: RowSplit, seed: np.random.SeedSequence
+    fitter: Fitter, start: Mapping[str, np.ndarray], split: RowSplit, seed: np.random.SeedSequence,
+    executor: Executor | None = None,
 ) -> float:  # fmt: skip
     """Log predictive density of the rows of `train` that come later, fitted to the first ones.
 
@@ -92,7 +103,7 @@ def predicted_later(
     SSMError : it cannot be fitted, or predicts nothing.
     """
     fit = fitter.fit(split.reference_train, seed, dict(start), FROM_NEARBY)
-    found = predict(fitter, fit, split.train, split.reference_validation, seed)
+    found = predict(fitter, fit, split.train, split.reference_validation, seed, executor)
     return float(found.log_density.sum(axis=1).mean())
 
 

@@ -8,6 +8,7 @@ estimate: E z^2 = 1 + tau^2 V of a group of basis functions with strengths of va
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -109,6 +110,11 @@ def _worth(
     def values(wanted: Sequence[tuple[int, ...]], stage: str) -> list[float]:
         sets = [[groups[k] for k in each] for each in wanted]
         one = partial(_predicted, augmented, tuple(chosen), start, sets, split, seed)
+        if len(sets) == 1:  # runs of its filter go over the executor, not itself
+            with checkpoint.failures.guard(stage):
+                made = checkpoint.computed(stage, partial(one, 0, checkpoint.executor))
+                return [float(made["value"])]
+            return [-np.inf]
         found = checkpoint.map(stage, len(sets), one)
         failed = [checkpoint.failures.record_task(stage, numbers) for numbers in found]
         return [
@@ -131,12 +137,13 @@ def _worth(
 def _predicted(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
     sets: Sequence[Sequence[Group]], split: RowSplit, seed: np.random.SeedSequence, k: int,
+    executor: Executor | None = None,
 ) -> Numbers:  # fmt: skip
     """What the superset with the groups `sets[k]` predicts of the second part, fitted to the first;
     -inf where it cannot."""
     fitter, begin = superset(augmented, chosen, start, sets[k])
     try:
-        return {"value": np.array(predicted_later(fitter, begin, split, seed))}
+        return {"value": np.array(predicted_later(fitter, begin, split, seed, executor))}
     except SSMError:
         return {"value": np.array(-np.inf)}
 

@@ -39,6 +39,7 @@ from ssmppl.diagnosis.selection.overlooked import (
     elsewhere,
     most_promising,
     overlooked,
+    trials,
 )
 from ssmppl.diagnosis.selection.refit import (
     EXPLAINED,
@@ -249,7 +250,8 @@ class EffectSelection:
         """Mechanisms where what only describes a misfit gains most."""
         seed, stage = self._seed(Choice.OVERLOOKED), "refitting mechanisms of that equation"
         shapes = overlooked(self.screen, refits, critical_gain(self.screen, self.alpha))
-        one = partial(best_start, self.augmented, out.base, self.screen, shapes, tuple(self.train))
+        tried = [trials(self.screen, columns) for columns in shapes]
+        one = partial(best_start, self.augmented, out.base, tried, tuple(self.train))
         starts = self.checkpoint.map("looking for mechanisms of that equation", len(shapes), one)
         for (k, *_), numbers in zip(shapes, starts, strict=True):
             name = f"the likelihood with {self.screen.design.candidates[k]}"

@@ -12,7 +12,8 @@ looked at whatever leads, but for a model that calls a simulator.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -104,8 +105,31 @@ def _allowed(screen: Screen, k: int) -> bool:
     return not found.status[k] and found.sided[k] * found.z[k] >= -AGAINST
 
 
+@dataclass(frozen=True)
+class Trial:
+    """Strengths of one shape of a mechanism whose likelihood is looked at. strengths : without
+    sign, the smallest first. elsewhere : its shape, where that is none of the screen's."""
+
+    column: int
+    candidate: Candidate
+    strengths: np.ndarray
+    elsewhere: Mapping[str, float]
+
+
+def trials(screen: Screen, columns: Sequence[int]) -> list[Trial]:
+    """Each shape of a mechanism as it is, and the first with others elsewhere, one at a time."""
+    candidates, first = screen.design.candidates, columns[0]
+    out = [Trial(k, candidates[k], _strengths(screen, k), {}) for k in columns]
+    for name, (low, high) in shape_bounds(candidates[first], screen.design.scales).items():
+        for value in np.linspace(low, high, ELSEWHERE + 2)[1:-1]:
+            shape = {name: float(value)}
+            c = candidates[first].with_shape(**shape)
+            out.append(Trial(first, c, out[0].strengths, shape))
+    return out
+
+
 def best_start(
-    augmented: AugmentedModels, base: Fit, screen: Screen, shapes: Sequence[Sequence[int]],
+    augmented: AugmentedModels, base: Fit, tried: Sequence[Sequence[Trial]],
     train: Sequence[Experiment], i: int,
 ) -> Numbers:  # fmt: skip
     """The column, the strength and the shape elsewhere, if any, with which the mechanism i fits
@@ -113,15 +137,15 @@ def best_start(
     model as it is."""
     level = augmented.base_fitter.value(train, base.theta)
     best, out = level, dict[str, Any]()
-    for k, shape in _every_shape(screen, shapes[i]):
-        c = screen.design.candidates[k].with_shape(**shape)
+    for trial in tried[i]:
+        c, price = trial.candidate, PRICE * bool(trial.elsewhere)
         try:
             fitter = augmented.fitter((c,))
             if only_by_particles(augmented, fitter):
                 continue
             for sign in _signs(c):
-                highest, price = -np.inf, PRICE * bool(shape)
-                for n, strength in enumerate(sign * _strengths(screen, k)):
+                highest = -np.inf
+                for n, strength in enumerate(sign * trial.strengths):
                     start = base.by_parameter | {c.strength: np.asarray(strength)}
                     theta = space_of(fitter.problem, fitter.fixed, start).theta
                     with warnings.catch_warnings():  # of a simulator that is pushed too hard
@@ -129,23 +153,14 @@ def best_start(
                         value = fitter.value(train, theta)
                     if value - price > best:
                         best = value - price
-                        out = {"column": k, "strength": strength, "gain": best - level}
-                        out |= {f"shape {name}": v for name, v in shape.items()}
+                        out = {"column": trial.column, "strength": strength, "gain": best - level}
+                        out |= {f"shape {name}": v for name, v in trial.elsewhere.items()}
                     falls, highest = not value > highest, max(value, highest)
                     if not value > level - HOPELESS or (falls and n + 1 >= len(GRID)):
                         break
         except SSMError:
             continue
     return {name: np.array(value) for name, value in out.items()}
-
-
-def _every_shape(screen: Screen, columns: Sequence[int]) -> Iterator[tuple[int, dict[str, float]]]:
-    """Each column as it is, and the first with each of its shapes elsewhere, one at a time."""
-    yield from ((k, {}) for k in columns)
-    bounds = shape_bounds(screen.design.candidates[columns[0]], screen.design.scales)
-    for name, (low, high) in bounds.items():
-        for value in np.linspace(low, high, ELSEWHERE + 2)[1:-1]:
-            yield columns[0], {name: float(value)}
 
 
 def elsewhere(numbers: Numbers) -> dict[str, float]:

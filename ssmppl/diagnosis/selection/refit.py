@@ -147,18 +147,51 @@ class Refit:
         return standard_errors(self.fit, self.fitter.fixed)
 
 
-def refit(
-    augmented: AugmentedModels, base: Fit, screen: Screen, index: Sequence[int],
-    train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
-    afresh: bool = False, approximate: bool = False, begin: Begin | None = None,
-) -> Refit | NotApplicable:  # fmt: skip
-    """Fit the model with the effects of `candidates`, of which the last are the screen's at
-    `index`, and the others are in `base`.
+@dataclass(frozen=True)
+class Start:
+    """Where a refit's fit starts, and all of the screen that it needs.
 
-    begin : where the fit of a single effect starts; None: where the screen's score says.
-    afresh : from the model's own start, with the strengths that the effects declare for that.
-    approximate : as of `Effort`.
+    afresh : from the model's own start, but for `values`. strengths : names of those that may be
+    too large. information : (names, matrix) of the parameters, for a fit by particles.
     """
+
+    values: Mapping[str, np.ndarray]
+    afresh: bool = False
+    strengths: Sequence[str] = ()
+    information: tuple[Sequence[str], np.ndarray] | None = None
+
+
+def start_of(
+    base: Fit, screen: Screen, index: Sequence[int], train: Sequence[Experiment],
+    candidates: Sequence[Candidate], afresh: bool = False, begin: Begin | None = None,
+) -> Start:  # fmt: skip
+    """Where the refit with `candidates` starts, of which the last are the screen's at `index`, and
+    the others are in `base`.
+
+    begin : where that of a single effect does; None: where the screen's score says.
+    afresh : with the strengths that the effects declare for that.
+    """
+    if afresh:
+        return Start({c.strength: np.asarray(c.effect.afresh) for c in candidates}, afresh=True)
+    new = candidates[-len(index) :]
+    if begin is not None:
+        strength = {new[-1].strength: np.asarray(begin.strength)}
+        return Start(base.by_parameter | dict(begin.parameters) | strength)
+    values = start_at(base, screen.design, screen.efficient, index)
+    for k, c in zip(index, new, strict=True):
+        if _of_other_length(screen, k, c):
+            values[c.strength] = np.asarray(START)
+    information = _information(screen, index, train)
+    return Start(values, strengths=[c.strength for c in new], information=information)
+
+
+def refit(
+    augmented: AugmentedModels, base: Fit, index: Sequence[int], candidates: Sequence[Candidate],
+    train: Sequence[Experiment], seed: np.random.SeedSequence, start: Start,
+    approximate: bool = False,
+) -> Refit | NotApplicable:  # fmt: skip
+    """Fit the model with the effects of `candidates`, of which the last are those at `index`, and
+    the others are in `base`. approximate : as of `Effort`."""
     candidates = tuple(candidates)
     effort = effort_for(candidates, approximate)
     try:
@@ -168,22 +201,12 @@ def refit(
                 f"{' and '.join(map(str, candidates))}: only a particle filter gives its "
                 "likelihood, and that would call the simulator for each of its particles"
             )
-        if afresh:
-            strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
-            fit = fitter.fit(train, seed, strengths)
-        elif begin is not None:
-            start = base.by_parameter | dict(begin.parameters)
-            start[candidates[-1].strength] = np.asarray(begin.strength)
-            fit = fitter.fit(train, seed, start, effort)
+        if start.afresh:
+            fit = fitter.fit(train, seed, start.values)
         else:
-            start = start_at(base, screen.design, screen.efficient, index)
-            for k, c in zip(index, candidates[-len(index) :], strict=True):
-                if _of_other_length(screen, k, c):
-                    start[c.strength] = np.asarray(START)
-            new = [c.strength for c in candidates[-len(index) :]]
-            start = _backtracked(fitter, start, new, train, seed)
-            information = None if fitter.exact else _information(fitter, screen, index, train)
-            fit = fitter.fit(train, seed, start, effort, information=information)
+            values = _backtracked(fitter, dict(start.values), start.strengths, train, seed)
+            information = _placed(fitter, start.information)
+            fit = fitter.fit(train, seed, values, effort, information=information)
         for _ in range(AGAIN):
             if not open_ended(fit, base):
                 break
@@ -228,9 +251,9 @@ def _backtracked(
     fitter: Fitter, start: dict[str, np.ndarray], strengths: Sequence[str],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """The start, or one with smaller strengths of the last effects where that is more likely: the
-    quadratic may promise a top beyond the data's cliff."""
-    if fitter.exact:
+    """The start, or one with smaller strengths where that is more likely: the quadratic may promise
+    a top beyond the data's cliff."""
+    if fitter.exact or not strengths:
         return start
     tried = [start | {n: share * start[n] for n in strengths} for share in SHARES]
     points = np.array([space_of(fitter.problem, fitter.fixed, s).theta for s in tried])
@@ -239,10 +262,10 @@ def _backtracked(
 
 
 def _information(
-    fitter: Fitter, screen: Screen, index: Sequence[int], train: Sequence[Experiment]
-) -> np.ndarray | None:
-    """(P, P) of the fitter's parameters, from the simulated sets of the screen; None where a
-    strength scales a process, whose score at zero tells nothing."""
+    screen: Screen, index: Sequence[int], train: Sequence[Experiment]
+) -> tuple[Sequence[str], np.ndarray] | None:
+    """Of the parameters with a score, from the simulated sets of the screen: names and matrix; None
+    where a strength scales a process, whose score at zero tells nothing."""
     at, design = list(index), screen.design
     if np.any(design.quadratic[at]):
         return None
@@ -252,7 +275,16 @@ def _information(
         [screen.simulated.nuisance, screen.simulated.candidate_scores[:, at]], axis=1
     )
     rows = [sum(e.steps for e in es) for es in (train, screen.experiments)]
-    found = scores.T @ scores / len(scores) * rows[0] / rows[1]
+    return names, scores.T @ scores / len(scores) * rows[0] / rows[1]
+
+
+def _placed(
+    fitter: Fitter, information: tuple[Sequence[str], np.ndarray] | None
+) -> np.ndarray | None:
+    """The information as (P, P) of the fitter's parameters, where its fits need one."""
+    if fitter.exact or information is None:
+        return None
+    names, found = information
     place = {repr(s): i for i, s in enumerate(fitter.problem.trace.parameter_symbols)}
     own = np.array([place[n] for n in names])
     out = np.zeros((len(place), len(place)))
@@ -447,8 +479,13 @@ def refit_all(
     if begins is not None:
         added = [(*a[:-1], a[-1].with_shape(**b.shape)) for a, b in zip(added, begins, strict=True)]
 
-    one = partial(_one, augmented, base, screen, list(sets), tuple(train), seed, added, afresh,
-                  approximate, simulation, begins)  # fmt: skip
+    known: Sequence[Begin | None] = [None] * len(sets) if begins is None else begins
+    starts = [
+        start_of(base, screen, index, train, candidates, afresh, begin)
+        for index, candidates, begin in zip(sets, added, known, strict=True)
+    ]
+    one = partial(_one, augmented, base, list(sets), tuple(train), seed, added, starts,
+                  approximate, simulation)  # fmt: skip
     done, reasons = [], []
     results = checkpoint.map(stage, len(sets), one)
     for i, (index, candidates, numbers) in enumerate(zip(sets, added, results, strict=True)):
@@ -469,8 +506,8 @@ def refit_all(
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
         cost += PRICE * sum(_of_other_length(screen, k, shaped[k]) for k in index)
-        begin = None if begins is None else begins[i]
-        cost += PRICE * bool(begin is not None and begin.shape)
+        begin = known[i]
+        cost += PRICE * bool(begin and begin.shape)
         made = Refit(tuple(index), candidates, fitter, fit, gain, cost, begin=begin)
         done.append(made.simulated(train, numbers, simulation))
     done.sort(key=lambda r: -r.score)
@@ -483,17 +520,14 @@ def _of_other_length(screen: Screen, k: int, c: Candidate) -> bool:
 
 
 def _one(
-    augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
+    augmented: AugmentedModels, base: Fit, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
-    added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool,
-    simulation: SimulationGain | None, begins: Sequence[Begin] | None, k: int,
+    added: Sequence[tuple[Candidate, ...]], starts: Sequence[Start], approximate: bool,
+    simulation: SimulationGain | None, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
     own = child_seed(seed, Task.REFIT, k)
-    begin = None if begins is None else begins[k]
-    found = refit(
-        augmented, base, screen, sets[k], train, own, added[k], afresh, approximate, begin
-    )
+    found = refit(augmented, base, sets[k], added[k], train, own, starts[k], approximate)
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}
     if simulation is None:

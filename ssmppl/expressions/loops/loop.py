@@ -53,7 +53,7 @@ class Loop:
         self._key = (name, fixed, *map(id, self.update))
         self.digest = hashlib.sha256(
             repr(
-                [(op, places, _data_text(data)) for op, places, data in pack(self.update)]
+                [(op, places, _data_text(data)) for op, places, data in pack(self.update)[0]]
             ).encode()
         ).hexdigest()[:8]
 
@@ -67,9 +67,7 @@ class Loop:
         return f"{self.name}_{self.digest}"
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        table = pack(self.update)
-        place = {node: i for i, node in enumerate(unpack(table))}
-        return _unpacked, (self.name, table, [place[e] for e in self.update], self.fixed)
+        return _unpacked, (self.name, *pack(self.update), self.fixed)
 
     @property
     def moving(self) -> tuple[Expr, ...]:

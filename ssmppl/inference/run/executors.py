@@ -33,6 +33,7 @@ from ssmppl.language.model.pickling import UnpackedCache, digest_of, packed, unp
 
 MOST = 8  # functions that a worker keeps; each may hold the data
 _functions: UnpackedCache[Callable[..., Any]] = UnpackedCache(MOST)
+_here = threading.local()
 
 
 def check_executor(executor: Any) -> None:
@@ -119,7 +120,13 @@ class _Received:
         function = _functions.get(
             self.digest, None if content is None else lambda: _opened(content)
         )
-        return Absent() if function is None else function(*args)
+        if function is None:
+            return Absent()
+        before, _here.one_core = getattr(_here, "one_core", False), True
+        try:
+            return function(*args)
+        finally:
+            _here.one_core = before
 
 
 def _opened(content: bytes) -> Callable[..., Any]:
@@ -190,10 +197,14 @@ def workers_of(executor: Executor | None) -> int | None:
 
 @contextmanager
 def threads_unless(executor: Executor | None, tasks: int) -> Iterator[Executor]:
-    """The executor, or as many threads as tasks and cores allow."""
+    """The executor, or as many threads as tasks and cores allow. In a task that came from another
+    process there are none: the other cores are those of the tasks beside it."""
     if executor is not None:
         with _with_room(executor) as room:
             yield room
+        return
+    if getattr(_here, "one_core", False):
+        yield InPlace()
         return
     with ThreadPoolExecutor(max_workers=max(1, min(tasks, cpu_count()))) as threads:
         yield threads

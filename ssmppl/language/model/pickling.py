@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copyreg
 import hashlib
+import io
 import pickle
 import sys
 import threading
@@ -17,6 +18,8 @@ from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 
 from ssmppl.errors import Location, ModelError
+from ssmppl.expressions.arrays import ExprArray, nodes_of, of_nodes
+from ssmppl.expressions.expr import Expr, pack, unpack
 
 try:
     import cloudpickle
@@ -28,14 +31,38 @@ Thing = TypeVar("Thing")
 _own = threading.local()
 
 
+class _Packer(pickle.Pickler if cloudpickle is None else cloudpickle.Pickler):  # type: ignore[misc]
+    """Writes a number for each expression, of which all that is packed has one table: parts that
+    expressions share, as those of a model and its derivatives do, are written once."""
+
+    def __init__(self, file: io.BytesIO):
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        self.nodes: dict[Expr, int] = {}
+
+    def persistent_id(self, thing: Any) -> int | None:
+        return self.nodes.setdefault(thing, len(self.nodes)) if type(thing) is Expr else None
+
+    def reducer_override(self, thing: Any) -> Any:
+        if type(thing) is ExprArray:
+            return of_nodes, (nodes_of(thing), thing.shape)
+        return NotImplemented if cloudpickle is None else super().reducer_override(thing)
+
+
+class _Unpacker(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, nodes: list[Expr]):
+        super().__init__(file)
+        self.persistent_load = nodes.__getitem__  # type: ignore[method-assign]
+
+
 def packed(value: Any) -> bytes:
     """Pickled: by cloudpickle where it is installed, so that what a notebook defines travels."""
-    if cloudpickle is None:
-        return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
     before = getattr(_own, "by_value", False)
-    _own.by_value = True
+    _own.by_value = cloudpickle is not None
     try:
-        content: bytes = cloudpickle.dumps(value)
+        packer = _Packer(file := io.BytesIO())
+        packer.dump(value)
+        dumps = pickle.dumps if cloudpickle is None else cloudpickle.dumps
+        content: bytes = dumps((*pack(packer.nodes), file.getvalue()), pickle.HIGHEST_PROTOCOL)
     finally:
         _own.by_value = before
     return content
@@ -43,7 +70,9 @@ def packed(value: Any) -> bytes:
 
 def unpacked(content: bytes) -> Any:
     """What was packed; both picklers write what pickle reads."""
-    return pickle.loads(content)
+    table, places, body = pickle.loads(content)
+    nodes = unpack(table)
+    return _Unpacker(io.BytesIO(body), [nodes[i] for i in places]).load()
 
 
 def digest_of(content: bytes) -> bytes:

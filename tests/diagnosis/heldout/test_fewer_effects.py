@@ -46,7 +46,7 @@ def chain(names):
     ],
 )
 def test_what_does_not_carry_is_not_named(monkeypatch, names, later, left):
-    def predicted(fitter, start, split, seed):
+    def predicted(fitter, start, split, seed, executor):
         if later[fitter] is FAILS:
             raise SamplingError("it predicts nothing", fix="none")
         return later[fitter]

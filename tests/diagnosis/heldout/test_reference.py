@@ -90,7 +90,7 @@ def test_it_is_told_whether_the_reference_has_curves(monkeypatch, chosen, curves
     rows = gain_ratio.HeldOutRows(
         None, split, (None, base), None, own if chosen else None, None, (None, base)
     )
-    assert rows.gain("curves", None, None).curves == curves
+    assert rows.gain("curves", None, Checkpoint(None, {})).curves == curves
 
 
 def test_without_curves_it_is_the_model_itself_as_it_was_fitted(monkeypatch):

@@ -19,7 +19,7 @@ from ssmppl.diagnosis.report.words import headline, how_far, how_sure, leaders, 
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.effect_selection import SelectionResult
-from ssmppl.diagnosis.selection.refit import refit, refit_all
+from ssmppl.diagnosis.selection.refit import refit, refit_all, start_of
 from ssmppl.diagnosis.verdict import decision
 from ssmppl.diagnosis.verdict.results import Results, labels
 from ssmppl.inference.run.problem import missing_of, pose
@@ -76,7 +76,8 @@ def loaded():
     )
     assert not failed
     both = [design.candidates[k] for k in (load, bias)]
-    found = refit(augmented, fit, screen, [load, bias], train, seed_sequence(5), both)
+    start = start_of(fit, screen, [load, bias], train, both)
+    found = refit(augmented, fit, [load, bias], both, train, seed_sequence(5), start)
     found = dataclasses.replace(
         found, fit=found.fitter.with_information(found.fit, seed_sequence(6))
     )

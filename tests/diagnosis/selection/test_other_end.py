@@ -9,7 +9,7 @@ import pytest
 from ssmppl.diagnosis.selection import other_end
 from ssmppl.diagnosis.selection.input_delays import best_delay
 from ssmppl.diagnosis.selection.other_end import at_the_other_end
-from ssmppl.diagnosis.selection.refit import Begin, Refit, refit
+from ssmppl.diagnosis.selection.refit import Begin, Refit, refit, start_of
 from ssmppl.errors import SamplingError
 from ssmppl.inference.preparation.space import space_of
 from tests.diagnosis.selection.test_input_delays import late
@@ -105,5 +105,6 @@ def test_a_refit_begins_at_the_parameters_that_are_given(input_late, monkeypatch
     only = SimpleNamespace(base_fitter=augmented.base_fitter, fitter=lambda candidates: fitter)
     names = list(base.by_parameter)
     given = {n: 1.01 * seen.fit.by_parameter[n] for n in names}
-    refit(only, base, screen(), (3,), experiments, None, (DELAY,), begin=Begin(0.9, {}, given))
+    start = start_of(base, screen(), (3,), experiments, (DELAY,), begin=Begin(0.9, {}, given))
+    refit(only, base, (3,), (DELAY,), experiments, None, start)
     assert begun[0] == given | {DELAY.strength: 0.9}

@@ -18,6 +18,7 @@ from ssmppl.diagnosis.selection.overlooked import (
     elsewhere,
     most_promising,
     overlooked,
+    trials,
 )
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.selection.shapes import shape_bounds
@@ -146,7 +147,7 @@ def test_a_stop_that_simulated_sets_go_beyond_is_found_at_a_finite_strength(stop
     augmented, base, screen, train = stopped
     shapes = [k for k, c in enumerate(screen.design.candidates)
               if c.form == "upper" and c.effect.name == "hard stop"]  # fmt: skip
-    found = best_start(augmented, base, screen, [shapes], train, 0)
+    found = best_start(augmented, base, [trials(screen, shapes)], train, 0)
     k, strength = int(found["column"]), float(found["strength"])
     c = screen.design.candidates[k]
     h = elsewhere(found).get("h", dict(c.shape)["h"])
@@ -176,19 +177,19 @@ def test_a_shape_beyond_those_of_the_screen_is_tried_and_has_its_price(stopped, 
          if c.form == "upper" and c.effect.name == "hard stop"),
         key=lambda k: dict(screen.design.candidates[k].shape)["h"],
     )  # fmt: skip
-    found = best_start(augmented, base, screen, [[k]], train, 0)
+    found = best_start(augmented, base, [trials(screen, [k])], train, 0)
     low, high = shape_bounds(screen.design.candidates[k], screen.design.scales)["h"]
     assert elsewhere(found)["h"] in np.linspace(low, high, module.ELSEWHERE + 2)[1:-1]
     assert elsewhere(found)["h"] > dict(screen.design.candidates[k].shape)["h"]
     monkeypatch.setattr(module, "PRICE", 1e9)
-    assert elsewhere(best_start(augmented, base, screen, [[k]], train, 0)) == {}
+    assert elsewhere(best_start(augmented, base, [trials(screen, [k])], train, 0)) == {}
 
 
 def test_no_start_where_every_strength_costs(stopped):
     augmented, base, screen, train = stopped
     shapes = [k for k, c in enumerate(screen.design.candidates) if c.form == "lower"]
     k = max(shapes, key=lambda k: dict(screen.design.candidates[k].shape)["h"])
-    assert best_start(augmented, base, screen, [[k]], train, 0) == {}
+    assert best_start(augmented, base, [trials(screen, [k])], train, 0) == {}
 
 
 def test_those_that_gain_most_are_fitted(stopped, monkeypatch):
@@ -231,7 +232,7 @@ def test_a_limit_that_no_filtered_state_goes_beyond_is_found_at_its_place(clippe
     augmented, base, screen, train = clipped
     shapes = [k for k, c in enumerate(screen.design.candidates)
               if (c.effect.name, c.form) == ("sensor clipping", "upper")]  # fmt: skip
-    found = best_start(augmented, base, screen, [shapes], train, 0)
+    found = best_start(augmented, base, [trials(screen, shapes)], train, 0)
     c = screen.design.candidates[int(found["column"])]
     assert 0.5 < elsewhere(found).get("c", dict(c.shape)["c"]) < 0.85
     assert float(found["gain"]) > 10.0

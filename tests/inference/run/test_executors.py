@@ -286,6 +286,18 @@ def test_a_function_is_unpickled_once_in_a_process():
     assert len(pickle.dumps(sent.task(whole=False))) < 500
 
 
+def threads_of_tasks(_=None):
+    return run_tasks(lambda _: threading.get_ident(), range(4)), threading.get_ident()
+
+
+def test_a_task_from_another_process_takes_one_core():
+    """Those that it has itself run one after the other: the other cores are other tasks' own."""
+    received = pickle.loads(pickle.dumps(Sent(threads_of_tasks).task()))
+    inside, own = received(None)
+    assert set(inside) == {own}
+    assert own not in threads_of_tasks()[0]  # here again
+
+
 def test_a_worker_says_what_it_does_not_know():
     sent = Sent(partial(Counted(3)))
     task = pickle.loads(pickle.dumps(sent.task(whole=False)))

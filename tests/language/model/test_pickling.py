@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.expr import symbol
 from ssmppl.language.model import pickling
 from tests.models import standard
 
@@ -112,6 +114,41 @@ def test_another_process_reads_what_a_script_wrote(tmp_path):
     path = tmp_path / "model.pkl"
     subprocess.run([sys.executable, "-c", SCRIPT, str(path)], check=True)
     assert likelihood(pickle.loads(path.read_bytes())) == likelihood(of_lambdas(sd=2.0))
+
+
+def test_what_expressions_share_is_packed_once():
+    """As a model and its derivatives: hundreds of expressions over one long sum."""
+    x = symbol("state", "x", ())
+    common = x
+    for k in range(400):
+        common = np.sin(common) + k
+    several = [common * k for k in range(2, 300)]
+    table = array(several[:4]).reshape(2, 2)
+    content = pickling.packed({"one": several, "again": {several[0]: common}, "table": table})
+    assert len(content) < 3 * len(pickling.packed(common))
+    back = pickling.unpacked(content)
+    assert all(a is b for a, b in zip(back["one"], several, strict=True))
+    assert back["again"] == {several[0]: common}
+    assert isinstance(back["table"], ExprArray)
+    assert back["table"].shape == (2, 2)
+    assert [back["table"][i] is table[i] for i in np.ndindex(2, 2)] == [True] * 4
+
+
+NOTHING_BUT_PICKLE = """
+import sys
+sys.modules["cloudpickle"] = None
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import symbol
+from ssmppl.language.model.pickling import packed, unpacked
+x = symbol("state", "x", ())
+there = {"e": 2 * x, "a": array([x, 2 * x])}
+back = unpacked(packed(there))
+assert back["e"] is there["e"] and back["a"][1] is there["e"]
+"""
+
+
+def test_expressions_are_packed_without_cloudpickle():
+    subprocess.run([sys.executable, "-c", NOTHING_BUT_PICKLE], check=True, timeout=120)
 
 
 def test_without_cloudpickle_it_is_refused_by_the_functions_line(monkeypatch):
