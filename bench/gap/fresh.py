@@ -16,7 +16,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-import ssmppl as ssm
+from bench.gap.diagnosed import Diagnosed
 from bench.gap.filter import terms
 from bench.gap.fit import Fitted, fit
 from bench.gap.plan import CELLS, SPLIT, entries
@@ -38,35 +39,44 @@ from ssmppl.modelfile import load_model
 
 CONFIRM = 0.7  # share of the rows before the confirm part
 RUNS = 20  # fresh runs
-PARTICLES = 1000
-REPEATS = 4  # runs of the particle filter on the set itself
-
-Rows = Callable[[pd.DataFrame, int], np.ndarray]  # data, repeats -> (repeats, T) log increments
+REPEATS = 8  # runs of a particle filter on the set itself
 
 
-def through(model: Model, parameters: dict[str, float]) -> Rows:
-    """One-step log predictive densities of a model by its particle filter."""
+@dataclass(frozen=True)
+class Predictive:
+    """Log predictive densities of the rows behind `CONFIRM`: of stretches or rows, (repeats, T)
+    with 0 before them, by repeated runs of a filter; and of all of them."""
+
+    rows: Callable[[pd.DataFrame, int], np.ndarray]
+    total: Callable[[pd.DataFrame], float]
+
+
+def through(model: Model, parameters: Mapping[str, float]) -> Predictive:
+    """Of a model by the filter that a diagnosis has for it."""
 
     def rows(data: pd.DataFrame, repeats: int) -> np.ndarray:
-        found = ssm.particle_filter(
-            model, data, parameters, particles=PARTICLES, repeats=repeats, seed=1
-        )
-        assert not isinstance(found, list)  # one experiment, one Dataset
-        return np.asarray(found["log_likelihood_increment"].values)
+        behind = np.arange(len(data)) >= cut_of(data)
+        return Diagnosed.of(model, data, parameters).predictive(behind, repeats)
 
-    return rows
+    return Predictive(rows, lambda data: Diagnosed.of(model, data, parameters).later(cut_of(data)))
 
 
-def reference(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Rows:
+def cut_of(data: pd.DataFrame) -> int:
+    """The first of the rows that no fit used."""
+    return int(CONFIRM * len(data))
+
+
+def reference(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Predictive:
     """The same of the true model, refitted to the first 70% of a set's rows."""
     found = refitted(system, answer, U, Y)
 
     def rows(data: pd.DataFrame, repeats: int) -> np.ndarray:
         U, Y = arrays(system, data)
         ll = terms(system, found.p, found.e, U, Y)[0].sum(axis=1)
+        ll[: cut_of(data)] = 0.0
         return np.repeat(ll[None], repeats, axis=0)
 
-    return rows
+    return Predictive(rows, lambda data: float(rows(data, 1).sum()))
 
 
 def refitted(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Fitted:
@@ -88,15 +98,20 @@ def arrays(system: System, data: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def share(
-    base: Rows, effect: Rows, true: Rows, system: System, answer: dict, data: pd.DataFrame
+    base: Predictive,
+    effect: Predictive,
+    true: Predictive,
+    system: System,
+    answer: dict,
+    data: pd.DataFrame,
 ) -> dict[str, float]:
     """F, its interval and F* of one model (NaN where no gap is measurable)."""
-    cut = int(CONFIRM * len(data))
-    parts = [rows(data, REPEATS)[:, cut:] for rows in (base, effect, true)]
+    models, cut = (base, effect, true), cut_of(data)
+    parts = [m.rows(data, REPEATS)[:, cut:] for m in models]
     found = gain_ratio(*parts)
     total = np.zeros(2)
     for fresh in fresh_runs(system, answer, data):
-        l0, lk, lc = (rows(fresh, 1)[0, cut:].sum() for rows in (base, effect, true))
+        l0, lk, lc = (m.total(fresh) for m in models)
         total += lk - l0, lc - l0
     return {
         "F": found.F,

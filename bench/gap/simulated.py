@@ -20,6 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import pandas as pd
 
+from bench.gap.diagnosed import Diagnosed
 from bench.gap.filter import predictions
 from bench.gap.fresh import CONFIRM, arrays, estimated, fresh_runs, handed_back, refitted
 from bench.gap.plan import CELLS, SPLIT, entries
@@ -27,13 +28,6 @@ from bench.gap.records import CACHE, Record
 from bench.gap.run import SETS
 from bench.gap.score import Scored, opened, records
 from bench.gap.truth import SYSTEMS, System
-from ssmppl.diagnosis.diagnose import PARTICLES, TWISTED_PARTICLES
-from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels, proposal_of
-from ssmppl.diagnosis.model.smoothing import Settings, samples_ahead
-from ssmppl.inference.preparation.space import space_of
-from ssmppl.inference.run.problem import missing_of, pose
-from ssmppl.inference.run.seeds import random_state, seed_sequence
-from ssmppl.inference.verbs.simulate import feeds_back
 from ssmppl.language.model.model import Model
 from ssmppl.modelfile import load_model
 
@@ -48,25 +42,12 @@ def simulating(model: Model, parameters: Mapping[str, float], channels: Sequence
     """Simulations of a model from its filtered states."""
 
     def means(data: pd.DataFrame, windows: Sequence[tuple[int, int]]) -> np.ndarray:
-        problem = pose(model, data)
-        proposal = proposal_of(problem.program)
-        number = (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)["full"]
-        e, trace = problem.experiments[0], problem.trace
-        missing = missing_of(problem.experiments)
-        fitter = AugmentedModels(trace, missing, {}, Settings(number, proposal)).base_fitter
-        given = {n: np.asarray(v) for n, v in parameters.items()}
-        theta = space_of(fitter.problem, fitter.fixed, given).theta
-        stream = random_state(seed_sequence(1))
-        filtered = fitter.smoother.filtered_draws(e, theta, stream)
         origins = np.array([first - 1 for first, _ in windows])
         reach = max(last - first for first, last in windows)
-        drawn = samples_ahead(
-            fitter.smoother.program, e, theta, *filtered, stream, feeds_back(trace), origins,
-            reach, DRAWS, np.arange(reach),
-        )  # fmt: skip
+        found = Diagnosed.of(model, data, parameters).simulated(origins, reach, DRAWS)
         out = np.full((len(data), len(channels)), np.nan)
-        for (first, last), samples in zip(windows, drawn, strict=True):
-            out[first:last] = samples[: last - first].mean(axis=-1)
+        for (first, last), mean in zip(windows, found, strict=True):
+            out[first:last] = mean[: last - first]
         return out
 
     return means

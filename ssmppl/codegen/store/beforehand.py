@@ -23,7 +23,7 @@ from typing import Any
 from numba import config
 
 from ssmppl.codegen.store import folder
-from ssmppl.language.model.pickling import packed
+from ssmppl.language.model.pickling import packed, unpacked
 
 ALONE = "SSMPPL_ONE_COMPILER"  # set, to anything, there is no other process
 _running: list[subprocess.Popen[bytes]] = []
@@ -56,7 +56,7 @@ def beforehand(*calls: Callable[[], Any]) -> Iterator[None]:
 def _start(calls: tuple[Callable[[], Any], ...]) -> None:
     """Called under the lock; there is one such process at a time, for the last question."""
     try:
-        content = pickle.dumps(sys.path) + packed(calls)
+        content = pickle.dumps(sys.path) + pickle.dumps(packed(calls))
     except Exception:  # of a model with something of the user's that cannot travel
         return
     end()
@@ -115,7 +115,7 @@ def _processors() -> int:
 
 def serve() -> None:
     """Of the other process: make the calls that come by its standard input."""
-    calls = pickle.load(sys.stdin.buffer)
+    calls = unpacked(pickle.load(sys.stdin.buffer))
     # The pipe is never written to again: it ends when who asked has ended, however it did.
     threading.Thread(target=_end_with, args=(sys.stdin.buffer,), daemon=True).start()
     for call in calls:

@@ -116,8 +116,12 @@ def _of_one(
                         f"the {called} of {name}, {e!r}, is {value:.6g} there, outside {allowed}"
                     )
                     return found, fix
+                if argument == law.trials and not value.is_integer():
+                    found = f"the {called} of {name}, {e!r}, is {value:.6g} there, no whole number"
+                    return found, fix
             else:
-                demand = f"the {called} of {name}, {e!r}, has to lie in {allowed}"
+                place = "be a whole number" if argument == law.trials else f"lie in {allowed}"
+                demand = f"the {called} of {name}, {e!r}, has to {place}"
                 might.append((demand, f"if it leaves that range, {fix}; if not, {DOMAIN}"))
     return _sums(law, values)
 
@@ -140,8 +144,9 @@ def _fix(law: Distribution, called: str, e: Expr, low: float, high: float) -> st
     """A function that maps all numbers into the range."""
     if called == law.trials:
         return (
-            f"write a {called} that is never below 0, np.maximum({e!r}, 0); where several flows "
-            "empty one compartment, draw each out of what the others have left"
+            f"write {called} whole and never below 0, np.maximum(np.round({e!r}), 0); where "
+            "several flows empty one compartment, draw each out of what the others have left, or "
+            "all at once by ssm.EulerMultinomial"
         )
     shares = law.shares()
     if shares is not None:

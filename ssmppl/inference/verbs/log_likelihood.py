@@ -11,18 +11,19 @@ import numpy as np
 from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters
-from ssmppl.errors import warn
+from ssmppl.errors import SamplingError, warn
 from ssmppl.inference.gaussian.likelihood import (
     APPROXIMATE,
     approximate_log_likelihood,
     approximation_of,
 )
-from ssmppl.inference.particles.filtering import estimates_task
+from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, full_run
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood
 from ssmppl.inference.preparation.proposal_choice import resolve_settings
 from ssmppl.inference.run.executors import check_executor
-from ssmppl.inference.run.problem import EXACT, pose
-from ssmppl.inference.run.seeds import seed_sequence
+from ssmppl.inference.run.invalid_laws import law_without_density_at
+from ssmppl.inference.run.problem import EXACT, Problem, pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.model import Model
 
@@ -112,7 +113,8 @@ def log_likelihood(
 
     Warns
     -----
-    UserWarning : "auto" took an approximation.
+    UserWarning : "auto" took an approximation; or every estimate is -inf, with the row and the
+        distribution at fault as far as they are known.
     """
     check_executor(executor)
     problem = pose(model, data)
@@ -131,9 +133,31 @@ def log_likelihood(
         if proposal == "auto" and settings.proposal == "extended":
             warn(BY_EXTENDED)
         exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
+        if exact == -np.inf:
+            _say_why_nothing(problem, theta)
         return np.full(repeats, exact)
     task = estimates_task(problem, theta, settings, seed_sequence(seed))
     tasks = min(TASKS if device == "cpu" else 1, repeats)  # a device has one queue
     pieces = [r for r in np.array_split(np.arange(repeats), tasks) if len(r)]
     ranges = [range(int(p[0]), int(p[-1]) + 1) for p in pieces]
-    return np.concatenate(run_tasks(task, ranges, executor=executor))
+    found = np.concatenate(run_tasks(task, ranges, executor=executor))
+    if np.all(found == -np.inf):
+        _say_why_nothing(problem, theta, settings)
+    return found
+
+
+def _say_why_nothing(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings | None = None
+) -> None:
+    """Warn of a likelihood of zero, where something is known of its cause: a distribution that has
+    no density at theta, or the row at which a filter by the settings loses its particles."""
+    none = law_without_density_at(problem.trace, theta)
+    if none is not None:
+        warn(f"the likelihood is zero: {none[0]}. Fix: {none[1]} ({none[2]})")
+    elif settings is not None:
+        stream = random_state(seed_sequence(0))
+        try:
+            for e in problem.experiments:
+                full_run(problem, e, theta, settings, stream, np.empty(0), stream.copy())
+        except SamplingError as error:
+            warn(f"the likelihood is zero: {error.found}. Fix: {error.fix}")

@@ -219,7 +219,7 @@ class Refusal:
     def _as_state(name: str) -> str:
         return (
             f"give {name!r} an initial distribution, its value at the first row, as ssm.Dirac(0), "
-            "and it is a state"
+            "and it is a state; of a vector as ssm.Dirac(np.zeros(n))"
         )
 
 

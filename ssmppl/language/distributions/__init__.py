@@ -38,6 +38,7 @@ from ssmppl.language.distributions.symmetric import (
     StudentT,
 )
 from ssmppl.language.distributions.truncated import Censored, Truncated
+from ssmppl.language.distributions.vectors.allocations import EulerMultinomial, Multinomial
 from ssmppl.language.distributions.vectors.correlations import LKJ
 from ssmppl.language.distributions.vectors.ordered import Ordered
 from ssmppl.language.distributions.vectors.shares import LogisticNormal
@@ -49,8 +50,8 @@ DISTRIBUTIONS: dict[str, type[Distribution]] = {
         Normal, MvNormal, LogNormal, StudentT, Laplace, Logistic, Cauchy, HalfNormal, HalfCauchy,
         Uniform, Exponential, Weibull, Pareto, Gamma, InverseGamma, Beta, VonMises, Dirichlet,
         Wishart, InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson,
-        NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical, Dirac, Truncated,
-        Censored, Mixture, ZeroInflated, Flat, HalfFlat,
+        NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical, Multinomial,
+        EulerMultinomial, Dirac, Truncated, Censored, Mixture, ZeroInflated, Flat, HalfFlat,
     )
 }  # fmt: skip
 

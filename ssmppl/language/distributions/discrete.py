@@ -22,9 +22,31 @@ from ssmppl.language.distributions.positive import Beta
 TINY = 1e-12  # in place of a rate or probability of zero, where logs would not be finite
 
 
+def log_of_count(count: Any, log_p: Any) -> ExprArray:
+    """The log of p to the power of a count: 0 where the count is 0, whatever p is."""
+    return where(ew("eq", count, 0.0), 0.0, array(count) * log_p)
+
+
 def _xlogy(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
-    """count * log(p), 0 where the count is 0 whatever p is."""
-    return where(ew("eq", count, 0.0), 0.0, array(count) * ew(log, p))
+    return log_of_count(count, ew(log, p))
+
+
+def whole(n: ExprArray) -> ExprArray | None:
+    """Whether numbers of trials are whole ones, element by element; None where all are known."""
+    if all(e.op == "const" for e in n.ravel()):
+        return None
+    return array(ew("eq", n, ew("floor", n)))
+
+
+def require_whole(law: Distribution, name: str) -> None:
+    """Refuse numbers of trials that are no whole ones."""
+    for e in law.parameters[name].ravel():
+        if e.op == "const" and not e.data.is_integer():
+            raise ModelError(
+                f"{type(law).__name__}: {name} = {e.data:g} is no whole number",
+                fix="give a whole number of trials",
+                where=law.location,
+            )
 
 
 def _events(lower: Any) -> tuple[Any, Any]:
@@ -190,13 +212,10 @@ class _OutOf(_Counts):
 
     def _require_trials(self) -> None:
         self._require("n", 0.0, strict=False)
-        for e in self.n.ravel():
-            if e.op == "const" and not e.data.is_integer():
-                raise ModelError(
-                    f"{type(self).__name__}: n = {e.data:g} is no whole number",
-                    fix="give a whole number of trials",
-                    where=self.location,
-                )
+        require_whole(self, "n")
+
+    def in_range(self):
+        return holding([super().in_range(), whole(self.n)])
 
     def support(self):
         return Support("integers", self._full(0.0), self.n)

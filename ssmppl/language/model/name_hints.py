@@ -39,9 +39,6 @@ HINTS: dict[str, str] = {
     **dict.fromkeys(
         ["normalmixture", "mixturesamefamily", "mixturegeneral", "gaussianmixture"], _MIXTURE
     ),
-    "multinomial": "ssm.Binomial for each category, out of those that are left: "
-    "ssm.Binomial(left, p[k] / np.sum(p[k:])), where `left`, the trials that no earlier category "
-    "has, is an input; where the total is random, independent ssm.Poisson",
     "dirichletmultinomial": "ssm.BetaBinomial(left, a[k], np.sum(a[k + 1:])) for each category but "
     "the last, where `left`, the trials that no earlier category has, is an input",
     **dict.fromkeys(["chisquared", "chisquare", "chi2"], "ssm.Gamma(df / 2, rate=1 / 2)"),
@@ -88,9 +85,12 @@ HINTS: dict[str, str] = {
     "coef": "ssm.maximize(model, data).parameters",
     "panelpomp": 'ssm.Model("name", experiment="unit"), and @model.prior(per="experiment") for '
     "parameters of each unit",
-    **dict.fromkeys(["eulermultinomial", "eulermultinom", "reulermultinom"],
-        "ssm.Binomial(n, 1 - np.exp(-total * dt)) for all that leave, and ssm.Binomial out of "
-        "these for each destination, whose draws later transition functions read as NAME_next"),
+    **dict.fromkeys(
+        ["eulermultinom", "reulermultinom", "deulermultinom"],
+        "ssm.EulerMultinomial(n, rates, dt), of which other transition functions read the counts "
+        "as NAME_next",
+    ),
+    **dict.fromkeys(["rmultinom", "dmultinom"], "ssm.Multinomial(n, p)"),
     **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
     **dict.fromkeys(
         ["skewnormal", "skewstudentt", "inversegaussian", "wald", "kumaraswamy",

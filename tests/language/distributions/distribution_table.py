@@ -406,6 +406,7 @@ TRUNCATED_CASES = [
 ]  # fmt: skip
 
 NOT_IN_SCIPY = {
+    "Multinomial", "EulerMultinomial",
     "Truncated", "Mixture", "ZeroInflated", "Dirac", "Flat", "HalfFlat", "LKJ", "Ordered",
     "Censored",
 }  # fmt: skip
