@@ -388,7 +388,9 @@ def check_start(trace: Trace) -> None:
         raise ModelError(
             f"the initial distribution of {flat[0].name!r} is Flat, which only a linear Gaussian "
             f"model may have, and this one is none: {reason}",
-            fix="give it a proper distribution; a vague one is one of large spread",
+            fix="give it a proper distribution of large spread, as ssm.Normal(0, sd=1e4): where "
+            "proposals look ahead the filter loses nothing by it, and the log-likelihood falls by "
+            "the log of the spread alone",
             where=flat[0].distribution.location,
         )
 

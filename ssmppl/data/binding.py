@@ -320,7 +320,8 @@ def _check_needed(
             raise DataError(
                 f"the observation is missing, and the transition of {site.name!r} needs it "
                 f"({site.where})",
-                fix="give it in all rows but the last, by interpolation for example, or write "
-                "the transition without it",
+                fix="give it in all rows but the last, or write the transition without it; where "
+                "state and observation share a noise, let that be a state, e, and observe "
+                "ssm.Dirac(... + e), which may be missing",
                 where=source.place(name, (int(np.argmax(gaps)), *component)),
             )
