@@ -24,7 +24,7 @@ from ssmppl.inference.particles.scores import (
 )
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
-from ssmppl.inference.preparation.proposal_choice import resolve_settings
+from ssmppl.inference.preparation.proposal_choice import ENOUGH, resolve_settings
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import model_attributes
@@ -128,6 +128,10 @@ def score(
     ------
     ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
     SamplingError : all weights vanish at some step; names the step, the row and the parameters.
+
+    Warns
+    -----
+    UserWarning : the runs' log-likelihoods differ so much that few of them count.
     """
     check_executor(executor)
     problem = pose(model, data)
@@ -159,6 +163,13 @@ def score(
         smoothing = Smoothing(settings, trajectories, kernel)
         runs = several_runs(scores, theta, smoothing, True, root, range(repeats), executor)
         found = combine(runs)
+        spread = float(np.std([r.log_z for r in runs], ddof=1))
+        if not spread <= ENOUGH:
+            warn(
+                f"the log-likelihoods of the {repeats} runs have a standard deviation of "
+                f"{spread:.3g} (proposal {settings.proposal!r}): the score rests on a few of them, "
+                "and its errors are too small. Give more particles, or another proposal="
+            )
         attrs |= {
             "method": "Fisher's and Louis' identities over backward trajectories",
             "particles": particles, "trajectories": trajectories, "repeats": repeats,

@@ -222,3 +222,22 @@ def test_where_there_is_no_finite_slope_score_says_so():
         found = ssm.score(model, data, {"b": 0.0, "c": 0.0})
     near = ssm.score(model, data, {"b": 1e-12, "c": 0.0})
     assert found.gradient["c"] == pytest.approx(near.gradient["c"], rel=1e-5)
+
+
+def test_runs_that_few_of_count_are_said(recwarn):
+    """A heavy-tailed track of which the first and the last row are known: no filter looks ahead."""
+    model = ssm.Model("track", inputs=("precision",))
+    model.prior(lambda: {"s": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, s: {"x": ssm.StudentT(4, x, scale=s)})
+    model.observation(lambda x, precision: {"y": ssm.Normal(x, sd=precision)})
+    data = {"y": np.array([0.0, *[np.nan] * 10, 3.0])}
+
+    def scored(sd):
+        given = data | {"precision": np.full(12, sd)}
+        return ssm.score(model, given, {"s": 0.5}, seed=1, particles=500, repeats=8)
+
+    scored(0.5)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="the 8 runs have a standard deviation of .*bootstrap"):
+        scored(1e-3)
