@@ -24,7 +24,13 @@ from ssmppl.errors import ArgumentError, Location, SamplingError, listing
 from ssmppl.inference.methods.settings import rescue_factor
 from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
-from ssmppl.inference.run.invalid_laws import DOMAIN, law_without_density_at, out_of_range, total_of
+from ssmppl.inference.run.invalid_laws import (
+    DOMAIN,
+    law_without_density_at,
+    out_of_range,
+    total_of,
+    trials_of_a_continuous_state,
+)
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.seeds import random_state
 
@@ -316,7 +322,8 @@ def failure(
             if found := out_of_range(law, known):
                 (why, fix), where = found, law.location
                 break
-    if not why and (none := law_without_density_at(problem.trace, theta)):
+    none = law_without_density_at(problem.trace, theta)
+    if not why and (none := none or trials_of_a_continuous_state(problem.trace)):
         why, fix, where = none
     return SamplingError(
         f"{_WHAT.get(status, 'the filter failed')} at t={t + 1}{label}, where {row}; "

@@ -12,11 +12,8 @@ import numpy as np
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import (
-    Distribution,
-    Truncated,
-)
+from ssmppl.expressions.expr import Expr, symbols_of, topological
+from ssmppl.language.distributions import Dirac, Distribution, Truncated
 from ssmppl.language.distributions.multivariate import Centred
 from ssmppl.language.distributions.nested import SUM_ROUNDING
 from ssmppl.language.model.trace import Trace
@@ -25,6 +22,7 @@ _SHARES = (
     "that are shares of 1 whatever the state, such as [1 - p, p] with "
     "p = 1 / (1 + np.exp(-z)), or w / np.sum(w) of positive w"
 )
+WHOLE = ("floor", "ceil")  # of which numbers of trials may be made
 DOMAIN = "some parameter, state or input leads outside the domain of an operation"
 
 
@@ -58,6 +56,28 @@ def law_without_density_at(trace: Trace, theta: np.ndarray) -> tuple[str, str, L
                         found[1],
                         site.distribution.location,
                     )
+    return None
+
+
+def trials_of_a_continuous_state(trace: Trace) -> tuple[str, str, Location] | None:
+    """Which observation counts out of a number that no particle has as a whole one: what was found,
+    the fix, and the user's line. None where every such number may be whole."""
+    drawn = {
+        s for site in trace.transition.values()
+        if not site.distribution.discrete and not isinstance(site.distribution, Dirac)
+        for s in site.components
+    }  # fmt: skip
+    for site in trace.observations.values():
+        for law in _laws_in(site.distribution):
+            for e in law.parameters[law.trials].ravel() if law.trials else ():
+                inside = topological([e])
+                if drawn.isdisjoint(inside) or any(n.op in WHOLE for n in inside):
+                    continue
+                found = (
+                    f"the {law.trials} of {type(law).__name__}, {e!r}, is no whole number, as it "
+                    "depends on a state of a continuous distribution"
+                )
+                return found, _fix(law, law.trials, e, 0.0, np.inf), law.location
     return None
 
 
@@ -144,9 +164,9 @@ def _fix(law: Distribution, called: str, e: Expr, low: float, high: float) -> st
     """A function that maps all numbers into the range."""
     if called == law.trials:
         return (
-            f"write {called} whole and never below 0, np.maximum(np.round({e!r}), 0); where "
-            "several flows empty one compartment, draw each out of what the others have left, or "
-            "all at once by ssm.EulerMultinomial"
+            f"write {called} whole and never below 0, np.maximum(np.floor({e!r} + 0.5), 0); "
+            "where several flows empty one compartment, draw each out of what the others have "
+            "left, or all at once by ssm.EulerMultinomial"
         )
     shares = law.shares()
     if shares is not None:

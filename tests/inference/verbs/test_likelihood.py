@@ -325,11 +325,6 @@ LAWS_OF_A_STATE = {  # law of y, the argument that the state leads out of its ra
         "the rate of Poisson, x,",
         "np.exp(x)",
     ),
-    "trials": (
-        lambda x: ssm.Binomial(10 * x, 0.5),
-        "the n of Binomial, 10*x,",
-        "np.maximum(10*x, 0)",
-    ),
 }
 
 
@@ -391,6 +386,38 @@ def test_a_filter_names_the_argument_that_may_be_out_of_range_and_a_fix(name):
         ssm.log_likelihood(negative(law), data, {}, seed=1, particles=100)
     assert argument + " has to lie in" in str(filtered.value)
     assert fix in str(filtered.value)
+
+
+def test_trials_of_a_continuous_state_are_no_whole_numbers():
+    data = {"z": np.zeros(3), "y": np.ones(3)}
+    law = negative(lambda x: ssm.Binomial(10 * np.exp(x), 0.5))
+    with pytest.raises(ssm.SamplingError) as error:
+        ssm.particle_filter(law, data, {}, seed=1, particles=100)
+    assert "the n of Binomial, 10*exp(x), is no whole number" in error.value.found
+    assert "np.maximum(np.floor(10*exp(x) + 0.5), 0)" in error.value.fix
+    law = negative(lambda x: ssm.Binomial(np.maximum(np.floor(10 * np.exp(x) + 0.5), 0), 0.5))
+    assert np.isfinite(ssm.log_likelihood(law, data, {}, seed=1, particles=100)[0])
+
+
+ZERO = {
+    "n": (lambda N, p: ssm.Binomial(N, p), {"N": 10.5, "p": 0.5}, "N, is 10.5 there, no whole num"),
+    "p": (lambda N, p: ssm.Binomial(N, p), {"N": 9.0, "p": -0.2}, "p, is -0.2 there, outside"),
+    "row": (lambda N, p: ssm.Uniform(0, N + p), {"N": 2.0, "p": 0.5}, "zero at t=2, where y = 3"),
+}
+
+
+@pytest.mark.parametrize("name", ZERO)
+def test_a_likelihood_of_zero_says_why(name):
+    law, parameters, why = ZERO[name]
+    model = ssm.Model("zero")
+    model.prior(lambda: {"N": ssm.Flat(), "p": ssm.Flat()})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=0.3)})
+    model.observation(lambda x, N, p: {"y": law(N, p), "z": ssm.Laplace(x, scale=1)})
+    data = {"y": [2.0, 3.0, 1.0], "z": [0.1, 0.2, 0.3]}
+    with pytest.warns(UserWarning, match="the likelihood is zero: .*" + why):
+        found = ssm.log_likelihood(model, data, parameters, particles=50, repeats=2, seed=1)
+    assert found.tolist() == [-np.inf] * 2
 
 
 def test_an_asymmetric_matrix_has_no_likelihood():
