@@ -1,5 +1,7 @@
 """Blocks left out in turn: what only a search at finite strengths found is refitted in each."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ import ssmppl as ssm
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
 from ssmppl.diagnosis.selection.refit import Begin
+from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.diagnosis.selection.test_overlooked import stopped  # noqa: F401
 from tests.statistics.checks import seed_of
@@ -78,3 +81,20 @@ def test_what_a_search_found_is_refitted_with_its_shape(stopped):  # noqa: F811
     assert made.begin == begun
     assert dict(made.candidates[0].shape)[name] != 1.1
     assert made is out.chosen
+
+
+def test_only_chosen_effects_that_a_search_found_begin_there_again():
+    candidates = [SimpleNamespace(group=g) for g in "abc"]
+    begun = Begin(1.0, {})
+
+    def refit(k, begin):
+        return SimpleNamespace(index=(k,), begin=begin, candidates=(candidates[k],))
+
+    singles = [refit(0, begun), refit(1, begun), refit(2, None)]
+    results = SimpleNamespace(
+        screen=SimpleNamespace(design=SimpleNamespace(candidates=candidates)), refits=singles,
+        chosen=SimpleNamespace(candidates=(candidates[0], candidates[2])),
+    )  # fmt: skip
+    assert Results.searched.fget(results) == [(candidates[0], begun)]
+    results.chosen = None
+    assert Results.searched.fget(results) == []

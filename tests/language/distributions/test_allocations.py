@@ -15,7 +15,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
 from tests.language.distributions.test_distributions import draws_of, number
-from tests.statistics.checks import LEVEL, mean_one_p, seed_of
+from tests.statistics.checks import LEVEL, assert_within, deviations, mean_one_p, seed_of
 
 N = 4
 RATES, DT = np.array([0.7, 0.0, 1.9]), 0.3
@@ -125,14 +125,15 @@ HOSTS, BETA, MU, GONE, COUNTED = 5, 1.6, 0.3, 0.4, 0.7
 CASES = [1.0, 2.0, np.nan, 1.0, 0.0]
 
 
-def outbreak():
+def outbreak(prior):
     model = ssm.Model("outbreak")
+    model.prior(lambda: {"beta": prior})
     model.initial(lambda: {"S": ssm.Dirac(HOSTS - 1.0), "I": ssm.Dirac(1.0)})
 
     @model.transition
-    def flows(S, I):
+    def flows(S, I, beta):
         return {
-            "left": ssm.EulerMultinomial(S, [BETA * I / HOSTS, MU], 0.5),
+            "left": ssm.EulerMultinomial(S, [beta * I / HOSTS, MU], 0.5),
             "gone": ssm.Binomial(I, GONE),
         }
 
@@ -148,14 +149,14 @@ def outbreak():
 
 
 def test_flows_that_are_observed_are_told_to_be_states():
-    model = outbreak()
+    model = outbreak(ssm.Flat())
     model.observation(lambda left: {"cases": ssm.Binomial(left[0], 0.5)})
     with pytest.raises(ModelError) as error:
         ssm.explain(model)
     assert "ssm.Dirac(np.zeros(n))" in error.value.fix
 
 
-def enumerated():
+def enumerated(beta=BETA):
     """log p(y) by the forward recursion over (S, I)."""
     states = [(s, i) for s in range(HOSTS + 1) for i in range(HOSTS + 1)]
     weight = {x: float(x == (HOSTS - 1, 1)) for x in states}
@@ -164,7 +165,7 @@ def enumerated():
         if k:
             moved = dict.fromkeys(states, 0.0)
             for (s, i), w in weight.items():
-                p = exits([BETA * i / HOSTS, MU], 0.5)
+                p = exits([beta * i / HOSTS, MU], 0.5)
                 for new, dead in counts(s, 2) if w else ():
                     q = w * st.multinomial(s, p).pmf([new, dead, s - new - dead])
                     for gone in range(i + 1):
@@ -181,9 +182,31 @@ def enumerated():
 
 def test_a_filters_likelihood_is_unbiased():
     found = ssm.log_likelihood(
-        outbreak(), {"y": np.array(CASES)}, {}, particles=200, repeats=400, seed=seed_of("outbreak")
-    )
+        outbreak(ssm.Flat()),
+        {"y": np.array(CASES)},
+        {"beta": BETA},
+        particles=200,
+        repeats=400,
+        seed=seed_of("outbreak"),
+    )  # fmt: skip
     assert mean_one_p(np.asarray(found) - enumerated()) > LEVEL
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [ssm.PMMH(particles=60), ssm.PGAS(particles=20)], ids=str)
+def test_chains_have_the_posterior_of_a_rate(method):
+    """Its density by enumeration, on a grid that is as fine as its curve is smooth."""
+    log = np.linspace(math.log(0.02), math.log(60.0), 81)
+    prior = st.norm(0.5, 0.8)
+    weight = np.exp([prior.logpdf(v) + enumerated(math.exp(v)) for v in log])
+    weight /= weight.sum()
+    mean = float(weight @ log)
+    sd = float(np.sqrt(weight @ (log - mean) ** 2))
+    drawn = ssm.sample(
+        outbreak(ssm.LogNormal(0.5, sd=0.8)), {"y": np.array(CASES)}, method, draws=2000,
+        warmup=500, chains=4, seed=seed_of("rate", str(method)), progress=False,
+    )["posterior"]["beta"]  # fmt: skip
+    assert_within(deviations(np.log(drawn.values), mean=mean, sd=sd))
 
 
 def test_shapes_of_arguments_go_through_expressions():
