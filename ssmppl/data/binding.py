@@ -140,7 +140,8 @@ def bind_inputs(
         )
     (source,) = found
     source = with_time_step(trace, source)
-    values = {n: channel(source, n, shape, "input") for n, shape in trace.given_inputs.items()}
+    values = {n: channel(source, n, shape, "input", trace.component_names.labels(n))
+              for n, shape in trace.given_inputs.items()}  # fmt: skip
     rows = _rows(source, values, steps)
     _check_inputs(source, values)
     return _input_array(trace, values, rows, number), rows, source
@@ -163,11 +164,13 @@ class _Common:
 def _bind(
     trace: Trace, source: Source, need: bool, steps: int | None, common: _Common, number: float
 ) -> Experiment:
-    inputs = {n: channel(source, n, shape, "input") for n, shape in trace.given_inputs.items()}
+    inputs = {n: channel(source, n, shape, "input", trace.component_names.labels(n))
+              for n, shape in trace.given_inputs.items()}  # fmt: skip
     observed = {}
     for name, site in trace.observations.items():
-        if need or holds(source, name, site.shape):
-            observed[name] = channel(source, name, site.shape, "observation")
+        labels = trace.component_names.labels(name)
+        if need or holds(source, name, site.shape, labels):
+            observed[name] = channel(source, name, site.shape, "observation", labels)
     rows = _rows(source, {**observed, **inputs}, steps)
     for name, site in trace.observations.items():
         observed.setdefault(name, np.full((rows, *site.shape), np.nan))

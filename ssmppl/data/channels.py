@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,27 +11,37 @@ from ssmppl.data.sources import Source, check_single
 from ssmppl.data.values import Fault, as_numbers, number
 from ssmppl.errors import DataError, listing
 
+MOST_NAMED = 12  # columns in a message
+Labels = Sequence[Any]  # of a vector's components, as `coords` has them; empty where it has none
 
-def column_names(name: str, index: tuple[int, ...]) -> tuple[str, ...]:
+
+def column_names(name: str, index: tuple[int, ...], labels: Labels = ()) -> tuple[str, ...]:
+    """Under which a component may stand in a table, what is written first where one lacks."""
     inside = list(map(str, index))
-    return (f"{name}_{'_'.join(inside)}", f"{name}[{','.join(inside)}]",
-            f"{name}[{', '.join(inside)}]")  # fmt: skip
+    plain = (f"{name}_{'_'.join(inside)}", f"{name}[{','.join(inside)}]",
+             f"{name}[{', '.join(inside)}]")  # fmt: skip
+    if not labels:
+        return plain
+    label = str(labels[index[0]])
+    return (label, f"{name}_{label}", f"{name}[{label}]", *plain)
 
 
-def holds(source: Source, name: str, shape: tuple[int, ...]) -> bool:
+def holds(source: Source, name: str, shape: tuple[int, ...], labels: Labels = ()) -> bool:
     """Whether the data hold anything of the variable: its name, or one of its components'."""
     if name in source.columns:
         return True
     return any(
         c in source.columns for index in np.ndindex(*shape) if shape
-        for c in column_names(name, index)
+        for c in column_names(name, index, labels)
     )  # fmt: skip
 
 
-def channel(source: Source, name: str, shape: tuple[int, ...], role: str) -> np.ndarray:
+def channel(
+    source: Source, name: str, shape: tuple[int, ...], role: str, labels: Labels = ()
+) -> np.ndarray:
     """(T, *shape), NaN for missing."""
     if name in source.columns:
-        value = source.columns[name]
+        value = _in_order(source.columns[name], labels, name, source)
         check_single(value, name, source)
         array = _converted(source, name, name, value, ())
         if array.ndim == 1 and shape == (1,):
@@ -38,13 +49,14 @@ def channel(source: Source, name: str, shape: tuple[int, ...], role: str) -> np.
         if array.ndim == 0 or array.shape[1:] != shape:
             raise _wrong_shape(source, name, array, shape, role)
         return array
-    if not shape or not holds(source, name, shape):
-        raise _left_out(source, name, shape, role)
+    if not shape or not holds(source, name, shape, labels):
+        raise _left_out(source, name, shape, role, labels)
     parts = {}
     for index in np.ndindex(*shape):
-        column = next((c for c in column_names(name, index) if c in source.columns), None)
+        spelled = column_names(name, index, labels)
+        column = next((c for c in spelled if c in source.columns), None)
         if column is None:
-            raise _left_out(source, name, shape, role, index)
+            raise _left_out(source, name, shape, role, labels, index)
         check_single(source.columns[column], name, source)
         parts[index] = _converted(source, name, column, source.columns[column], index)
         if parts[index].ndim != 1:
@@ -60,6 +72,23 @@ def channel(source: Source, name: str, shape: tuple[int, ...], role: str) -> np.
     for index, part in parts.items():
         out[(slice(None), *index)] = part
     return out
+
+
+def _in_order(value: Any, labels: Labels, name: str, source: Source) -> Any:
+    """A table for a vector with its columns in the order of the components that they are named
+    after; other names are no labels, and stand for their places."""
+    given = [str(c) for c in getattr(value, "columns", ())]
+    wanted = [str(label) for label in labels]
+    if not set(given) & set(wanted) or given == wanted:
+        return value
+    if set(wanted) <= set(given) and len(set(given)) == len(given):
+        return value.iloc[:, [given.index(w) for w in wanted]]
+    raise DataError(
+        f"the columns of {name!r} are {', '.join(given)}, and its components {', '.join(wanted)}",
+        fix="give a column of each component's name (of NaN, if nothing of it was measured), or "
+        f"an array in the order of the components, data[{name!r}].to_numpy()",
+        where=source.place(name),
+    )
 
 
 def _converted(
@@ -101,24 +130,26 @@ def _left_out(
     name: str,
     shape: tuple[int, ...],
     role: str,
+    labels: Labels = (),
     index: tuple[int, ...] | None = None,
 ) -> DataError:
     things = "columns" if source.kind == "DataFrame" else "variables"
     wanted = f" of shape (T, {', '.join(map(str, shape))})" if shape else ""
     found = f"{_a(role)} named {name!r}{wanted} is missing from the {source.kind}"
     if index is not None:
-        names = ", ".join(column_names(name, i)[0] for i in np.ndindex(*shape))
-        first = column_names(name, index)[0]
+        names = ", ".join(column_names(name, i, labels)[0] for i in np.ndindex(*shape))
+        first = column_names(name, index, labels)[0]
         found = f"{_a(role)} named {name!r} lacks its component {first!r}; needed are {names}"
-    wanted_name = name if index is None else column_names(name, index)[0]
+    wanted_name = name if index is None else column_names(name, index, labels)[0]
     fix = f"its {things} are: {listing(wanted_name, source.known)}; rename one, or add "
     fix += repr(wanted_name)
     if role == "observation":
         fix += " (a column of NaN, if nothing of it was measured)"
     if index is None and shape and source.kind == "DataFrame":  # no column has that shape
-        names = ", ".join(column_names(name, i)[0] for i in np.ndindex(*shape))
+        names = ", ".join(column_names(name, i, labels)[0] for i in np.ndindex(*shape))
         found = f"{_a(role)} named {name!r} is missing from the DataFrame; needed are {names}"
-        fix = f"its columns are: {listing(name, source.known)}; rename them to {names}"
+        fix = f"its columns are, in their order: {', '.join(source.known[:MOST_NAMED])}; rename to "
+        fix += f"{names} those that are meant"
     if not source.known:
         found = f"the {source.kind} holds no {things}, and needs {_a(role)} named {name!r}{wanted}"
         fix = f"give an array for {name!r}"

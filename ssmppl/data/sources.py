@@ -229,8 +229,9 @@ def _from_dataset(data: Any, label: str) -> Source:
         if wide and str(name) in source.known:
             source.columns[str(name)] = _Wide(wide[0], variable.sizes[wide[0]])
             continue
-        variable = variable.squeeze(extra, drop=True)
-        source.columns[str(name)] = variable.transpose("time", ...).values
+        variable = variable.squeeze(extra, drop=True).transpose("time", ...)
+        labelled = variable.ndim == 2 and variable.dims[1] in variable.coords
+        source.columns[str(name)] = variable.to_pandas() if labelled else variable.values
     if "time" in data.coords:
         source.time = _labels(data["time"], source)
     return source

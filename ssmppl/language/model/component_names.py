@@ -97,6 +97,11 @@ class ComponentNames:
             dims[n] = (dim, *self.dims.get(n, rest))
         return ComponentNames(dims, {**self.coords, dim: labels})
 
+    def labels(self, name: str) -> tuple[Any, ...]:
+        """Of the components of a vector; empty where it has none, or several axes."""
+        axes = self.dims.get(name, ())
+        return self.coords.get(axes[0], ()) if len(axes) == 1 else ()
+
     def check(self, shapes: Shapes, where: Location) -> None:
         """Hold them against the shapes of the model's quantities.
 
