@@ -26,6 +26,39 @@ __all__ = ["NO_METHOD", "Estimate", "by_name", "make_estimate", "table"]
 NO_METHOD = "none"  # where every parameter is fixed
 
 
+# What the results of statsmodels' state space models have under these names.
+_SMOOTHED = "ssm.smooth(model, data, estimate), which has means and standard deviations"
+_FILTERED = "ssm.kalman_filter(model, data, estimate)"
+_RESIDUALS = (
+    f"{_FILTERED}, of which `y_predicted`, `y_predicted_sd` and `y_pit` give and test one-step "
+    "errors, and ssm.plot_predictions"
+)
+_AHEAD = "ssm.forecast(model, estimate, data=data, steps=12)"
+_LONGER = f"the verb with the longer data, as {_FILTERED}"
+_TABLE = "print(estimate), or estimate.table()"
+ELSEWHERE: dict[str, str] = {
+    **dict.fromkeys(("params", "coef"), "estimate.parameters, by name"),
+    **dict.fromkeys(("llf", "loglike", "loglik"), "estimate.log_likelihood"),
+    **dict.fromkeys(("bse", "se", "stderr"), "estimate.standard_errors"),
+    **dict.fromkeys(("cov_params", "vcov"), "estimate.covariance"),
+    **dict.fromkeys(("summary", "params_table"), _TABLE),
+    **dict.fromkeys(
+        ("tvalues", "zvalues", "pvalues", "conf_int"),
+        "estimate.table(), whose estimates and standard errors make them",
+    ),
+    **dict.fromkeys(("get_forecast", "forecast", "predict", "get_prediction"), _AHEAD),
+    **dict.fromkeys(("append", "extend", "apply"), _LONGER),
+    **dict.fromkeys(("smoothed_state", "smoother_results", "states", "level"), _SMOOTHED),
+    **dict.fromkeys(("filtered_state", "filter_results", "fittedvalues"), _FILTERED),
+    **dict.fromkeys(
+        ("resid", "standardized_forecasts_error", "plot_diagnostics", "test_normality",
+         "test_serial_correlation", "test_heteroskedasticity"), _RESIDUALS,
+    ),
+    "simulate": "ssm.simulate(model, estimate, steps=100)",
+    "plot_components": "ssm.plot_components(model, ssm.smooth(model, data, estimate))",
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Estimate:
     """Parameters that maximise the likelihood (or the posterior density), with their uncertainty.
@@ -58,6 +91,37 @@ class Estimate:
     iterates: xr.Dataset
     attrs: dict[str, Any] = field(default_factory=dict)
     names: ComponentNames = field(default_factory=ComponentNames)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name not in ELSEWHERE:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        raise AttributeError(f"an estimate has no {name!r}: write {ELSEWHERE[name]}")
+
+    @property
+    def free_numbers(self) -> int:
+        """How many numbers were estimated: free components, and starts that have no prior."""
+        return len(self.covariance) + int(self.attrs.get("flat_starts", 0))
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, 2 k - 2 log p(y), k `free_numbers`; NaN of a posterior mode.
+
+        Likelihoods under flat starts are densities with respect to them: only models with the same
+        ones compare.
+        """
+        return 2.0 * self.free_numbers - 2.0 * self._likelihood
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, k log n - 2 log p(y), n the rows in which anything was measured;
+        as of `aic`."""
+        rows = float(self.attrs.get("measured_rows", np.nan))
+        return self.free_numbers * np.log(rows) - 2.0 * self._likelihood
+
+    @property
+    def _likelihood(self) -> float:
+        """The log-likelihood, where that is what was maximised."""
+        return self.log_likelihood if self.attrs.get("objective") == "likelihood" else np.nan
 
     def __repr__(self) -> str:
         lines, rows = [*self._head(), ""], self._rows()

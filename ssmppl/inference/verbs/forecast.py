@@ -145,6 +145,8 @@ def _ahead(
     )
     u = np.concatenate([past.u, future])
     _check_after(past.time, labels)  # before a time step between them is made of it
+    if labels is not None and traced.time_step is None:
+        _say_gap(past, labels)
     _set_step_between(traced, u, past.time, labels)
     check_defined(traced, source, u, after=rows)
     feedback = feeds_back(traced)
@@ -355,6 +357,25 @@ def _check_after(time: np.ndarray, labels: np.ndarray | None) -> None:
             f"inputs begin at {first}, and the data end at {last}: {early} of their {len(labels)} "
             "rows are not after the data",
             fix=f"give the inputs of the rows after {last} only, or without labels",
+        )
+
+
+def _say_gap(past: _Past, labels: np.ndarray) -> None:
+    """Warn where the inputs are labelled otherwise than the rows that follow evenly spaced ones: a
+    row is a step of the model, whatever it is called."""
+    if len(past.time) < 2 or past.time.dtype.kind != labels.dtype.kind or spacing(past.time):
+        return
+    due = after(past.time, len(labels), past.zone)
+    if past.time.dtype.kind == "M":
+        same = np.array_equal(due.astype("datetime64[s]"), labels.astype("datetime64[s]"))
+    else:
+        same = past.time.dtype.kind not in "iuf" or np.allclose(due, labels)
+    if not same:
+        given, wanted = (f"{label_text(v[0])} to {label_text(v[-1])}" for v in (labels, due))
+        warn(
+            f"inputs are of {given}, and the rows after the data are {wanted}: they are taken for "
+            "these, one row for each step of the model. Give the inputs of all rows after the "
+            "data, or the rows in between in the data, with NaN for what was not measured"
         )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.structure import noisy_start
+from ssmppl.analysis.structure import flat_start, noisy_start
 from ssmppl.arguments import checked_with
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, warn, written_as
@@ -172,6 +172,9 @@ def maximize(
             for label, e, f in zip(labels, errors, free, strict=True)
             if f
         }
+    attrs["measured_rows"] = int(sum(e.seen.any(axis=1).sum() for e in problem.experiments))
+    attrs["flat_starts"] = sum(len(s.components) for s in flat_start(problem.trace))
+    attrs["flat_starts"] *= len(problem.experiments)
     attrs["seconds"] = time.perf_counter() - began
     return make_estimate(
         problem.trace, ascent.theta, covariance, value, ascent.iterates, fixed_values, attrs,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.datasets import nile
 from ssmppl.errors import ArgumentError
 
 model = ssm.Model("walk", dims={"b": ["season"]}, coords={"season": ["wet", "dry"]})
@@ -57,3 +60,41 @@ def test_labels_are_all_there(given, fix):
 def test_a_number_has_no_labels():
     with pytest.raises(ArgumentError, match="give one number"):
         ssm.log_likelihood(model, DATA, {"q": {"wet": 0.5}, "b": [0.2, 0.1]})
+
+
+def test_criteria_are_those_of_statsmodels_but_for_the_flat_starts_constant():
+    """Which has d / 2 log(2 pi) less log-likelihood for d flat starts."""
+    from statsmodels.tsa.statespace.structural import UnobservedComponents
+
+    y = np.asarray(nile(), dtype=float)
+    y[[10, 11, 40]] = np.nan
+    model = ssm.Model("level")
+    ssm.structural.observe(model, "y", ssm.structural.level(model))
+    found = ssm.maximize(model, {"y": y}, seed=1)
+    other = UnobservedComponents(y, "llevel", use_exact_diffuse=True).fit(disp=False)
+    assert found.free_numbers == other.df_model
+    assert found.aic == pytest.approx(other.aic - np.log(2 * np.pi), abs=1e-3)
+    # statsmodels counts rows without data among those that the criterion is of
+    penalty = found.free_numbers * (np.log(len(y)) - np.log(len(y) - 3))
+    assert found.bic == pytest.approx(other.bic - penalty - np.log(2 * np.pi), abs=1e-3)
+    held = ssm.maximize(model, {"y": y}, fixed={"y_sd": 120.0}, seed=1)
+    assert held.free_numbers == 2
+    mode = ssm.maximize(model, {"y": y}, objective="posterior", seed=1)
+    assert np.isnan(mode.aic)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("params", "estimate.parameters"), ("get_forecast", "ssm.forecast(model, estimate"),
+        ("append", "the verb with the longer data"), ("nonsense", "has no attribute 'nonsense'"),
+    ],
+)  # fmt: skip
+def test_what_others_call_it_is_answered(name, said):
+    model = ssm.Model("level")
+    ssm.structural.observe(model, "y", ssm.structural.level(model))
+    found = ssm.maximize(model, {"y": [1.0, 2.0, 0.5, 1.7]}, fixed={"level_sd": 0.5}, seed=1)
+    with pytest.raises(AttributeError) as error:
+        getattr(found, name)
+    assert said in str(error.value)
+    assert pickle.loads(pickle.dumps(found)).parameters == found.parameters

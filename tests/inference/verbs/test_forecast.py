@@ -325,3 +325,20 @@ def test_an_estimate_is_known_parameters():
         ssm.forecast(model(), estimate, inputs=inputs, proposal="laplace")
     with pytest.raises(ArgumentError, match="which is no parameters"):
         ssm.forecast(model(), 3.0, inputs=inputs, data=data)
+
+
+@pytest.mark.parametrize("first", ["2017-01-31", "2030-01-31"])
+def test_inputs_of_other_rows_than_those_that_follow_are_noticed(first, recwarn):
+    driven = ssm.Model("driven", inputs=("u",))
+    driven.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    driven.transition(lambda x, u: {"x": ssm.Normal(0.9 * x + u, sd=0.3)})
+    driven.observation(lambda x: {"y": ssm.Normal(x, sd=0.4)})
+    months = pd.date_range("2015-01-31", periods=24, freq="ME")
+    data = pd.DataFrame({"y": np.zeros(24), "u": 0.1}, index=months)
+    to_come = pd.DataFrame({"u": np.ones(3)}, index=pd.date_range(first, periods=3, freq="ME"))
+    ssm.forecast(driven, {}, inputs=to_come, data=data, seed=1)
+    said = [str(w.message) for w in recwarn]
+    if first == "2017-01-31":
+        assert not said
+    else:
+        assert "2030-01-31 to 2030-03-31, and the rows after the data are 2017-01-31 to" in said[0]
