@@ -44,7 +44,7 @@ OF_VERBS = _aliases(
     ("params theta coef par", "parameters"),
     ("observed observations obs y endog df", "data"),
     ("exog covariates covars controls", "inputs"),
-    ("nsteps numsteps nrows h nahead periods", "steps horizon"),
+    ("nsteps numsteps nrows h nahead periods nobs nsimulations nforecast", "steps horizon"),
     ("sampler algorithm algo kernel optimizer", "method"),
     ("targetaccept adaptdelta targetacceptprob", "target_acceptance"),
     ("essrmin essmin essthresh", "ess_threshold"),
@@ -138,10 +138,11 @@ EXECUTOR = "executor=, a pool of concurrent.futures, as ThreadPoolExecutor(4)"
 
 @dataclass(frozen=True)
 class _Verb:
-    """Its arguments, and the classes of its methods' settings."""
+    """Its arguments, the classes of its methods' settings, and what it is an attribute of."""
 
     own: list[str]
     methods: tuple[type, ...]
+    place: str = "ssm"
 
 
 # Filled by the decorators below; by name, in the order of import.
@@ -224,10 +225,16 @@ def _setting_hint(name: str, own: Sequence[str], kind: type) -> str:
     return of_others + _own_arguments(kind.__name__, own)
 
 
+def _place(function: Function) -> str:
+    """Of a verb: `ssm`, or the module below it that is asked for it."""
+    part = function.__module__.partition("ssmppl.")[2].partition(".")[0]
+    return f"ssm.{part}" if part in ("structural", "simulators") else "ssm"
+
+
 def _of_other_verbs(name: str) -> str:
     meant = {n: name if name in v.own else called_here(name, v.own, OF_VERBS)
              for n, v in _VERBS.items()}  # fmt: skip
-    having = [f"ssm.{n}" for n, m in meant.items() if m]
+    having = [f"{_VERBS[n].place}.{n}" for n, m in meant.items() if m]
     return f"it is an argument of {_either(having, 'and')}; " if having else ""
 
 
@@ -247,7 +254,7 @@ def checked_with(methods: Iterable[type]) -> Callable[[Function], Function]:
 
     def decorate(function: Function) -> Function:
         signature, name = inspect.signature(function), function.__name__
-        _VERBS[name] = _Verb(list(signature.parameters), tuple(methods))
+        _VERBS[name] = _Verb(list(signature.parameters), tuple(methods), _place(function))
 
         counts = "progress" in signature.parameters
 

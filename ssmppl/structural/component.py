@@ -13,6 +13,7 @@ import numpy as np
 from ssmppl.compiling import parse
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.expressions.expr import user_location
+from ssmppl.language.checks.rules import a
 from ssmppl.language.distributions import Distribution, Flat, Normal
 from ssmppl.language.model.model import Model
 from ssmppl.language.written import functions_of
@@ -110,9 +111,16 @@ class Writer:
         self.diffuse = False
         model.begin()
         known = present(model)
+        if name in known and kind == "observe":
+            raise ArgumentError(
+                f"the model has an observation of {name!r} already",
+                fix="give it all that is summed at once, or another channel a name of its own; in "
+                "a notebook, run the cell of ssm.Model(...) again before its components",
+                where=user_location(),
+            )
         if name in known:
             raise ArgumentError(
-                f"the model has a component named {name!r} already, a {known[name].kind}",
+                f"the model has a component named {name!r} already, {a(known[name].kind)}",
                 fix=f'give this one a name of its own, ssm.structural.{kind}(m, ..., name="'
                 f'{name}_2"); in a notebook, run the cell of ssm.Model(...) again before its '
                 "components",

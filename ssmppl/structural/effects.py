@@ -117,11 +117,13 @@ def intervention(
     ------
     ArgumentError : an argument is of the wrong kind, or the model has a component of this name.
     """
-    w = Writer(model, "intervention", f"{kind}_{row}" if name is None else name)
+    value = np.asarray(row)
+    numbered = value.shape == () and value.dtype.kind in "iu" and value >= 1
+    own = f"{kind}_{row}" if numbered and kind in KINDS else "change"
+    w = Writer(model, "intervention", own if name is None else name)
     if kind not in KINDS:
         raise w.wrong("kind", kind, f"give one of: {', '.join(map(repr, KINDS))}")
-    value = np.asarray(row)
-    if value.shape != () or value.dtype.kind not in "iu" or value < 1:
+    if not numbered:
         raise w.wrong(
             "row", row, "give the number of a row, counted from 1; of a date it is "
             "np.searchsorted(dates, date) + 1",

@@ -365,7 +365,9 @@ class ExactClimb:
             value, gradient = self.exact.score(point.theta)
         except SamplingError:
             self._check(point.theta)
-            raise
+            if not np.isfinite(self.best_value):
+                raise
+            return nothing  # a step too far: rounding, as where scales are of all sizes
         slope = point.pull(gradient)
         if self.setup.with_prior:
             value, slope = value + point.log_prior, slope + point.d_log_prior

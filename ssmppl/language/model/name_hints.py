@@ -64,6 +64,24 @@ HINTS: dict[str, str] = {
     **dict.fromkeys(["mcmc", "nuts"], "ssm.sample(model, data)"),
     "fit": "ssm.sample(model, data) for a posterior, ssm.maximize(model, data) for an estimate",
     **dict.fromkeys(["mle", "optimize", "optimise"], "ssm.maximize(model, data)"),
+    # statsmodels
+    **dict.fromkeys(
+        ["unobservedcomponents", "structts", "bsts"],
+        "ssm.structural: level, trend, seasonal, cycle, ... written into an ssm.Model, and "
+        "ssm.structural.observe",
+    ),
+    **dict.fromkeys(
+        ["sarimax", "arima", "arma", "autoreg"],
+        "ssm.structural.autoregression, or the companion form as a transition with ssm.Dirac for "
+        "what is observed of it",
+    ),
+    **dict.fromkeys(
+        ["mlemodel", "dynamicfactor", "dynamicfactormq", "varmax"],
+        "the model as functions of an ssm.Model, and ssm.maximize(model, data)",
+    ),
+    **dict.fromkeys(
+        ["loglike", "llf"], "ssm.log_likelihood(model, data, parameters)"
+    ),
     # MATLAB's System Identification Toolbox
     **dict.fromkeys(
         ["pem", "greyest", "nlgreyest", "ssest", "estimate"], "ssm.maximize(model, data)"

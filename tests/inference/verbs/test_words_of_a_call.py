@@ -98,7 +98,7 @@ def test_filter_is_told_as_a_filter():
 
 @pytest.mark.parametrize("columns", [["y0", "y1"], pd.MultiIndex.from_product([["a"], ["y", "z"]])])
 def test_columns_of_a_vector_are_named(columns):
-    with pytest.raises(ssm.DataError, match=r"needed are y_0, y_1\n.*rename them to y_0, y_1"):
+    with pytest.raises(ssm.DataError, match=r"needed are y_0, y_1\n.*rename to y_0, y_1 those"):
         ssm.kalman_filter(walk(2), pd.DataFrame(np.ones((3, 2)), columns=columns), {"q": 1.0})
 
 
