@@ -40,7 +40,7 @@ def channel(
     source: Source, name: str, shape: tuple[int, ...], role: str, labels: Labels = ()
 ) -> np.ndarray:
     """(T, *shape), NaN for missing."""
-    if name in source.columns:
+    if name in source.columns and not _is_label(name, labels, source):
         value = _in_order(source.columns[name], labels, name, source)
         check_single(value, name, source)
         array = _converted(source, name, name, value, ())
@@ -72,6 +72,12 @@ def channel(
     for index, part in parts.items():
         out[(slice(None), *index)] = part
     return out
+
+
+def _is_label(name: str, labels: Labels, source: Source) -> bool:
+    """Whether a column of the variable's name is that of its component so called."""
+    known = [str(label) for label in labels]
+    return name in known and all(k in source.columns for k in known)
 
 
 def _in_order(value: Any, labels: Labels, name: str, source: Source) -> Any:

@@ -51,6 +51,13 @@ def test_columns_go_by_their_names_whatever_their_order(data):
     assert value(data) == RIGHT
 
 
+def test_a_component_may_be_called_as_the_channel():
+    names = ["gdp", "y", "hours"]
+    frame = pd.DataFrame(Y, columns=names)
+    assert value(frame[["y", "hours", "gdp"]], names) == RIGHT
+    assert value({"y": Y}, names) == RIGHT
+
+
 def test_names_that_are_no_labels_stand_for_their_places():
     other = FRAME.rename(columns=dict(zip(SERIES, "abc", strict=True)))
     assert value({"y": other}) == RIGHT

@@ -150,14 +150,15 @@ def _say_why_nothing(
     problem: Problem, theta: np.ndarray, settings: FilterSettings | None = None
 ) -> None:
     """Warn of a likelihood of zero, where something is known of its cause: a distribution that has
-    no density at theta, or the row at which a filter by the settings loses its particles."""
+    no density at theta, or the row at which a bootstrap filter loses its particles."""
     none = law_without_density_at(problem.trace, theta)
     if none is not None:
         warn(f"the likelihood is zero: {none[0]}. Fix: {none[1]} ({none[2]})")
     elif settings is not None:
+        plain = FilterSettings(settings.particles, "bootstrap")
         stream = random_state(seed_sequence(0))
         try:
             for e in problem.experiments:
-                full_run(problem, e, theta, settings, stream, np.empty(0), stream.copy())
+                full_run(problem, e, theta, plain, stream, np.empty(0), stream.copy())
         except SamplingError as error:
             warn(f"the likelihood is zero: {error.found}. Fix: {error.fix}")
