@@ -316,7 +316,10 @@ class ExactClimb:
                 fix="give start={name: value} near plausible values",
             )
         if not np.isfinite(gap) and not (interrupted or unbounded):
-            stopped = "the optimiser reached the boundary: no interior maximum"
+            stopped = (
+                "no interior maximum was reached from this start; where scales are of other sizes "
+                "than one, give start={name: value} of theirs"
+            )
         point = self.setup.transform.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
