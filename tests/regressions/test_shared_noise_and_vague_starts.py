@@ -40,7 +40,7 @@ def by_state():
     def transition(x, e, rho):
         mean = 0.9 * x + rho * 0.5 * e / 0.4
         return {
-            "x": ssm.Normal(mean, sd=0.5 * np.sqrt(1 - rho**2)), "e": ssm.Normal(0 * e, sd=0.4),
+            "x": ssm.Normal(mean, sd=0.5 * np.sqrt(1 - rho**2)), "e": ssm.Normal(0, sd=0.4),
         }  # fmt: skip
 
     model.observation(lambda x, e: {"y": ssm.Dirac(x + e)})
