@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ssmppl.diagnosis.selection import other_end
-from ssmppl.diagnosis.selection.input_delays import best_delay
+from ssmppl.diagnosis.selection import refit as module
+from ssmppl.diagnosis.selection.input_delays import START, best_delay
 from ssmppl.diagnosis.selection.other_end import at_the_other_end
 from ssmppl.diagnosis.selection.refit import Begin, Refit, refit, start_of
 from ssmppl.errors import SamplingError
@@ -90,6 +91,16 @@ def test_none_without_one_that_gains_enough_and_none_that_did_as_well(input_late
     assert told([seen], status=("", "", "constant", "", "")) == [3]
     monkeypatch.setattr(other_end, "MOST", 1)
     assert told([seen]) == [2]
+
+
+def test_a_delay_of_another_length_than_the_screens_starts_at_a_strength_of_its_own(monkeypatch):
+    """The score that was of another length says nothing of it."""
+    monkeypatch.setattr(module, "start_at", lambda *_: {DELAY.strength: 0.2})
+    monkeypatch.setattr(module, "_information", lambda *_: None)
+    own = start_of(None, screen(), (3,), (), (DELAY,))
+    other = start_of(None, screen(), (3,), (), (DELAY.with_shape(delay=ROWS + 2),))
+    assert own.values[DELAY.strength] == 0.2
+    assert other.values[DELAY.strength] == START
 
 
 def test_a_refit_begins_at_the_parameters_that_are_given(input_late, monkeypatch):

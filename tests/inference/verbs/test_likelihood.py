@@ -399,6 +399,16 @@ def test_trials_of_a_continuous_state_are_no_whole_numbers():
     assert np.isfinite(ssm.log_likelihood(law, data, {}, seed=1, particles=100)[0])
 
 
+def test_trials_of_a_count_are_not_blamed_for_a_row_that_is_too_high():
+    model = ssm.Model("count")
+    model.initial(lambda: {"S": ssm.Poisson(5)})
+    model.transition(lambda S: {"S": ssm.Binomial(S, 0.9)})
+    model.observation(lambda S: {"y": ssm.Binomial(S, 0.5)})
+    with pytest.raises(ssm.SamplingError) as error:
+        ssm.particle_filter(model, {"y": [2.0, 400.0]}, {}, seed=1, particles=100)
+    assert "whole number" not in error.value.found
+
+
 ZERO = {
     "n": (lambda N, p: ssm.Binomial(N, p), {"N": 10.5, "p": 0.5}, "N, is 10.5 there, no whole num"),
     "p": (lambda N, p: ssm.Binomial(N, p), {"N": 9.0, "p": -0.2}, "p, is -0.2 there, outside"),
