@@ -28,7 +28,7 @@ import pandas as pd
 from bench.gap.diagnosed import Diagnosed
 from bench.gap.filter import terms
 from bench.gap.fit import Fitted, fit
-from bench.gap.plan import CELLS, SPLIT, entries
+from bench.gap.plan import CELLS, SPLIT, Entry, entries
 from bench.gap.records import CACHE, Record
 from bench.gap.run import SETS
 from bench.gap.score import opened, records
@@ -167,13 +167,20 @@ def of_record(record: Record, answer: dict) -> dict[str, float]:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+Measured = Callable[[Record, dict], dict[str, float]]  # record and its answer -> numbers to keep
+
+
+def measure_each(
+    kept_in: str, of_record: Measured, wanted: Callable[[Entry, Record], bool], about: str | None
+) -> None:
+    """Measure the records that the command line asks for and that are not in the cache's file yet;
+    of the arm none, which has no filter of its own."""
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--half", choices=list(SPLIT["halves"]))
     parser.add_argument("--cell", choices=CELLS)
     parser.add_argument("--method", default="diagnose")
     options = parser.parse_args()
-    path = CACHE / "fresh.json"
+    path = CACHE / kept_in
     done: dict[str, dict[str, dict[str, Any]]] = (
         json.loads(path.read_text()) if path.exists() else {}
     )
@@ -181,12 +188,10 @@ def main() -> None:
     kept = records(options.method)
     for entry in entries():
         record = kept.get(entry.id)
-        wanted = options.half in (None, entry.half) and options.cell in (None, entry.cell)
-        if entry.system not in SYSTEMS:  # the arm has no filter of its own
+        asked = options.half in (None, entry.half) and options.cell in (None, entry.cell)
+        if not asked or entry.system not in SYSTEMS or record is None or not record.model_text:
             continue
-        if not wanted or not entry.effects or record is None or not record.model_text:
-            continue
-        if mine.get(entry.id, {}).get("digest") == record.digest:
+        if mine.get(entry.id, {}).get("digest") == record.digest or not wanted(entry, record):
             continue
         found = of_record(record, opened([entry.id])[entry.id])
         mine[entry.id] = {**found, "digest": record.digest}
@@ -195,4 +200,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    measure_each("fresh.json", of_record, lambda entry, _: bool(entry.effects), __doc__)

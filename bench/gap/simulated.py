@@ -13,8 +13,6 @@ sets whose class is not right, or that are not of one effect, are left out.
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -22,11 +20,19 @@ import pandas as pd
 
 from bench.gap.diagnosed import Diagnosed
 from bench.gap.filter import predictions
-from bench.gap.fresh import CONFIRM, arrays, estimated, fresh_runs, handed_back, refitted
-from bench.gap.plan import CELLS, SPLIT, entries
-from bench.gap.records import CACHE, Record
+from bench.gap.fresh import (
+    CONFIRM,
+    arrays,
+    estimated,
+    fresh_runs,
+    handed_back,
+    measure_each,
+    refitted,
+)
+from bench.gap.plan import Entry
+from bench.gap.records import Record
 from bench.gap.run import SETS
-from bench.gap.score import Scored, opened, records
+from bench.gap.score import Scored, opened
 from bench.gap.truth import SYSTEMS, System
 from ssmppl.language.model.model import Model
 from ssmppl.modelfile import load_model
@@ -102,31 +108,10 @@ def of_record(record: Record, answer: dict) -> dict[str, float]:
     return {name: float(np.sqrt(total[name] / total["true"])) for name in ("before", "after")}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--half", choices=list(SPLIT["halves"]))
-    parser.add_argument("--cell", choices=CELLS)
-    parser.add_argument("--method", default="diagnose")
-    options = parser.parse_args()
-    path = CACHE / "simulated.json"
-    done = json.loads(path.read_text()) if path.exists() else {}
-    mine = done.setdefault(options.method, {})
-    kept = records(options.method)
-    for entry in entries():
-        record = kept.get(entry.id)
-        wanted = options.half in (None, entry.half) and options.cell in (None, entry.cell)
-        if not wanted or entry.system not in SYSTEMS or record is None or not record.model_text:
-            continue
-        if len(entry.effects) != 1 or mine.get(entry.id, {}).get("digest") == record.digest:
-            continue
-        answer = opened([entry.id])[entry.id]
-        if not Scored(record, answer).right_class:
-            continue
-        found = of_record(record, answer)
-        mine[entry.id] = {**found, "digest": record.digest}
-        path.write_text(json.dumps(done, indent=1))
-        print(entry.id, {k: round(v, 3) for k, v in found.items()}, flush=True)
+def wanted(entry: Entry, record: Record) -> bool:
+    """Whether a set is of one effect, and its class right."""
+    return len(entry.effects) == 1 and Scored(record, opened([entry.id])[entry.id]).right_class
 
 
 if __name__ == "__main__":
-    main()
+    measure_each("simulated.json", of_record, wanted, __doc__)

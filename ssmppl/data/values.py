@@ -14,7 +14,13 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import Censored, Distribution, Truncated
+from ssmppl.language.distributions import (
+    Censored,
+    Distribution,
+    EulerMultinomial,
+    Multinomial,
+    Truncated,
+)
 from ssmppl.language.distributions.base import Support
 
 UNIT_ROUNDING = 1e-8  # by which a diagonal of ones may miss 1
@@ -196,6 +202,8 @@ def outside(
         if support.kind == "integers":
             bad |= np.isfinite(values) & (values != np.floor(values))
     if not bad.any():
+        if isinstance(distribution, (EulerMultinomial, Multinomial)):
+            return _wrong_total(distribution, values, upper[:, 0])
         return _out_of_order(values) if support.kind == "ordered" else None
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     low, high = lower[index], upper[index]
@@ -233,6 +241,26 @@ def _bound(bounds: np.ndarray, env: Values, rows: int, none: float) -> np.ndarra
             value = evaluate(bound, env)
             out[(slice(None), *index)] = np.where(np.isnan(value), none, value)
     return out
+
+
+def _wrong_total(
+    distribution: EulerMultinomial | Multinomial, values: np.ndarray, n: np.ndarray
+) -> Fault | None:
+    """Counts (T, K) that do not sum to n (T,), or to more than are there where some may stay;
+    infinite n are not known."""
+    total, all_placed = values.sum(axis=1), isinstance(distribution, Multinomial)
+    with np.errstate(invalid="ignore"):
+        bad = np.isfinite(n) & ((total > n) | (all_placed & (total < n)))
+    if not bad.any():
+        return None
+    row = int(np.argmax(bad))
+    counts = ", ".join(number(v) for v in values[row])
+    return Fault(
+        (row,),
+        f"the counts [{counts}] sum to {number(total[row])}, and n of {name_of(distribution)} is "
+        f"{number(n[row])} there",
+        "counts that sum to n" if all_placed else "counts that sum to n at most",
+    )
 
 
 def _outside_simplex(distribution: Distribution, values: np.ndarray) -> Fault | None:

@@ -149,7 +149,7 @@ def _of_one(
 def _sums(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, str] | None:
     """Shares that do not sum to 1, where their symbols have values."""
     called, own = law.shares() or ("", [])
-    for index in np.ndindex(law.shape):
+    for index in np.ndindex(array(own[0]).shape if own else ()):
         shares = [array(share)[index] for share in own]
         if symbols_of(shares) and symbols_of(shares) <= set(values):
             total = float(np.sum(evaluate(shares, values)))

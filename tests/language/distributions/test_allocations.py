@@ -10,7 +10,7 @@ import scipy.stats as st
 
 import ssmppl as ssm
 import ssmppl.language.distributions as D
-from ssmppl.errors import ModelError
+from ssmppl.errors import DataError, ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
@@ -154,6 +154,50 @@ def test_flows_that_are_observed_are_told_to_be_states():
     with pytest.raises(ModelError) as error:
         ssm.explain(model)
     assert "ssm.Dirac(np.zeros(n))" in error.value.fix
+
+
+def surveyed(law, inputs=("n",)):
+    """Of a state that is no matter: counts whose number of trials is an input."""
+    model = ssm.Model("survey", inputs=inputs)
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.9 * x, sd=0.3)})
+    model.observation(law)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("law", "counts", "said"),
+    [
+        (lambda x, n: {"y": ssm.Multinomial(n, share(x))}, [2.0, 2.0], "sum to 4, and n of Mult"),
+        (lambda x, n: {"y": ssm.Multinomial(n, share(x))}, [4.0, 2.0], "sum to 6, and n of Mult"),
+        (lambda x, n: {"y": ssm.EulerMultinomial(n, share(x), 1.0)}, [4.0, 2.0], "sum to 6, and"),
+    ],
+)
+def test_counts_that_do_not_sum_up_are_refused_by_row(law, counts, said):
+    data = {"n": [5.0, 5.0, 5.0], "y": [[3.0, 2.0], [np.nan, np.nan], counts]}
+    with pytest.raises(DataError) as error:
+        ssm.log_likelihood(surveyed(law), data, {}, seed=1)
+    assert said in error.value.found
+    assert "row 3" in str(error.value)
+    data["n"] = [5.0, 5.0, float(sum(counts))]
+    assert np.isfinite(ssm.log_likelihood(surveyed(law), data, {}, seed=1)[0])
+
+
+def share(x):
+    return [1 / (1 + np.exp(-x)), 1 / (1 + np.exp(x))]
+
+
+def test_shares_that_do_not_sum_to_one_are_named():
+    model = ssm.Model("shares")
+    model.prior(lambda: {"a": ssm.Flat()})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    model.observation(
+        lambda x, a: {"y": ssm.Multinomial(3, [a, 0.5]), "z": ssm.Laplace(x, scale=1)}
+    )
+    data = {"y": [[1.0, 2.0]], "z": [0.0]}
+    with pytest.warns(UserWarning, match="the probabilities of Multinomial.* sum to 0.7"):
+        assert ssm.log_likelihood(model, data, {"a": 0.2}, seed=1) == [-np.inf]
 
 
 def enumerated(beta=BETA):
