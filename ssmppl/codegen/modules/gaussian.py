@@ -146,8 +146,8 @@ class GaussianApproximation:
         """log p(y | theta) by the extended Kalman filter; -inf where it comes to no number, or to
         none that floating point resolves."""
         if getattr(self._room, "steps", None) != len(y):  # kept: it is called a thousand times
-            found, spread = self._empty(len(y))
-            self._room.arrays = found.x, *spread, *found.derivatives
+            found, spread = self._empty(1, len(y))
+            self._room.arrays = tuple(a[0] for a in (found.x, *spread, *found.derivatives))
             self._room.follow, self._room.steps = self.module.follow_filter, len(y)
         value = self._room.follow(theta, y, seen, u, *self._room.arrays)
         return float(value) if value < np.inf else -np.inf
@@ -174,17 +174,35 @@ class GaussianApproximation:
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
     ) -> FilterMoments | None:
         """What the extended Kalman filter tells; None where it comes to no number."""
-        found, (after, increments) = self._empty(len(y))
-        if not self.module.follow_filter(
-            theta, y, seen, u, found.x, after, increments, *found.derivatives
-        ) > -np.inf:  # fmt: skip
-            return None
+        made = self._followed(theta[None], y, seen, u)
+        found = FilterMoments(*(part[0] for part in vars(made).values()))
+        return found if found.increments[0] > -np.inf else None
+
+    def extended_at(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
+    ) -> FilterMoments:
+        """The same at points (B, P), with an axis (B,) before the others: where it comes to no
+        number the increments are -inf, and the moments zero."""
+        return self._followed(theta, y, seen, u)
+
+    def _followed(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
+    ) -> FilterMoments:
+        points, steps = len(theta), len(y)
+        found, (after, increments) = self._empty(points, steps)
+        arrays = found.x, after, increments, *found.derivatives
+        follow = self.module.follow_filter
+        for at, *own in zip(theta, *arrays, strict=True):
+            if not follow(at, y, seen, u, *own) > -np.inf:
+                for part in own:
+                    part[:] = 0.0
+                own[2][:] = -np.inf
         rest, jacobian, spread, spread_initial = found.derivatives[:4]
         before = np.zeros_like(after)
-        before[1:] = after[:-1]
-        cross = before @ jacobian.transpose(0, 2, 1)
-        predicted = jacobian @ cross + spread @ spread.transpose(0, 2, 1)
-        predicted[0] = spread_initial @ spread_initial.T
+        before[:, 1:] = after[:, :-1]
+        cross = before @ np.swapaxes(jacobian, -1, -2)
+        predicted = jacobian @ cross + spread @ np.swapaxes(spread, -1, -2)
+        predicted[:, 0] = spread_initial @ np.swapaxes(spread_initial, -1, -2)
         return FilterMoments(increments, found.x, after, rest, predicted, cross)
 
     # -- by points
@@ -331,14 +349,16 @@ class GaussianApproximation:
         known = made.found[0] != guide.NO_NUMBER and np.all(np.isfinite(made.x))
         return made.x if known else None
 
-    def _empty(self, steps: int) -> tuple[Linearised, tuple[np.ndarray, np.ndarray]]:
-        """Room for an extended Kalman filter: also for its covariances and increments."""
+    def _empty(self, points: int, steps: int) -> tuple[Linearised, tuple[np.ndarray, np.ndarray]]:
+        """Room for extended Kalman filters: also for their covariances and increments."""
         d = len(self.trace.state_symbols)
         r, r_initial = len(self.found.transition.noise), len(self.found.initial.noise)
         shapes = [(steps, d), (steps, d, d), (steps, d, r), (d, r_initial)]
         shapes += [(steps, d), (steps, d, d)]
-        found = Linearised(np.zeros((steps, d)), tuple(np.zeros(s) for s in shapes))
-        return found, (np.empty((steps, d, d)), np.empty(steps))
+        found = Linearised(
+            np.zeros((points, steps, d)), tuple(np.zeros((points, *s)) for s in shapes)
+        )
+        return found, (np.empty((points, steps, d, d)), np.empty((points, steps)))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ the F values that a gradient takes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -52,46 +52,25 @@ def increments_with_predictions(
     rows, channels = sum(e.steps for e in data), len(trace.observation_symbols)
     if observation is None or (1 + 2 * free) * rows * channels**2 > MOST:
         return None
-    one = _one(trace, gaussian, observation, data, shift)
 
     def values(theta: np.ndarray) -> tuple[np.ndarray, Predictions]:
-        found = [one(t) for t in theta]
-        predicted = [p for _, p in found]
-        return np.stack([r for r, _ in found]), Predictions(
-            np.stack([p.error for p in predicted]), np.stack([p.covariance for p in predicted])
+        rows, errors, covariances = [], [], []
+        for e in data:
+            found = gaussian.extended_at(theta, e.y, e.seen, e.u)
+            found.increments[:, 0] += shift
+            error, covariance = predictions_of_rows(
+                observation, trace, e, theta, found.predicted, found.predicted_covariance
+            )
+            none = found.increments[:, 0] == -np.inf
+            error[none], covariance[none] = 0.0, 0.0
+            rows.append(found.increments)
+            errors.append(error)
+            covariances.append(covariance)
+        return np.concatenate(rows, axis=1), Predictions(
+            np.concatenate(errors, axis=1), np.concatenate(covariances, axis=1)
         )
 
     return values
-
-
-def _one(
-    trace: Trace, gaussian: GaussianApproximation, observation: GaussianObservation,
-    data: Sequence[Experiment], shift: float,
-) -> Callable[[np.ndarray], tuple[np.ndarray, Predictions]]:  # fmt: skip
-    """theta (P,) -> the increments (R,) of all data sets and their predictions (R, ...)."""
-
-    def at(theta: np.ndarray) -> tuple[np.ndarray, Predictions]:
-        rows, errors, covariances = [], [], []
-        for e in data:
-            found = gaussian.extended(theta, e.y, e.seen, e.u)
-            if found is None:
-                own = np.full(e.steps, -np.inf)
-                error = np.zeros_like(e.y)
-                covariance = np.zeros((*e.y.shape, e.y.shape[1]))
-            else:
-                own = found.increments
-                own[0] += shift
-                error, covariance = predictions_of_rows(
-                    observation, trace, e, theta, found.predicted, found.predicted_covariance
-                )
-            rows.append(own)
-            errors.append(error)
-            covariances.append(covariance)
-        return np.concatenate(rows), Predictions(
-            np.concatenate(errors), np.concatenate(covariances)
-        )
-
-    return at
 
 
 @once_per_trace

@@ -26,7 +26,6 @@ from scipy.special import ndtr
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import flat_start
-from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
 from ssmppl.codegen.modules.filter_variants import compile_row_scores
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.program import Program, compile_trace
@@ -42,6 +41,7 @@ from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_mod
 from ssmppl.inference.particles.backward import ParticleSystem, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.seeds import fill_normal, fill_uniform
 from ssmppl.inference.verbs.simulate import feeds_back
 from ssmppl.language.distributions import Dirac, Flat
 from ssmppl.language.model.trace import Site, Trace, symbols

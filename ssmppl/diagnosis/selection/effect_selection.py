@@ -55,12 +55,13 @@ from ssmppl.diagnosis.selection.refit import (
     preferred,
     refit_all,
 )
-from ssmppl.diagnosis.selection.refit_test import CLOSER_LOOK_FACTOR, affordable, gain_p, refit_p
+from ssmppl.diagnosis.selection.refit_test import WORTH_A_TEST, affordable, gain_p, refit_p
 from ssmppl.diagnosis.selection.shapes import shaped_all
 from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, gain_of_base
 from ssmppl.errors import ArgumentError, SSMError
 
 AFRESH = "refitting from default start"
+CLOSER_LOOK_FACTOR = 4.0  # times alpha, up to which a second screen is worth finishing
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is run
 CARRIES_ON = 0.1  # of what a further cause gains one row ahead, that it has to gain beyond
@@ -344,14 +345,14 @@ class EffectSelection:
         the distribution of the scores, the same to first order (likelihood ratio and score
         tests)."""
         found = {r.index[0]: gain_p(self.screen, r) for r in out.refits}
-        if not found or min(found.values()) > CLOSER_LOOK_FACTOR * alpha:
+        if not found or min(found.values()) > WORTH_A_TEST:
             out.p |= found
             return False
         if affordable(self.augmented, self.train):
             anew = one_signed_candidates(self.screen)  # fits to simulated data would take too long
             rest = {k: p for k, p in found.items() if k not in anew}
             found = {k: p for k, p in found.items() if k in anew}
-            if min(rest.values(), default=1.0) <= CLOSER_LOOK_FACTOR * alpha:
+            if min(rest.values(), default=1.0) <= WORTH_A_TEST:
                 best = min(rest, key=lambda k: rest[k])
                 found[best] = refit_p(
                     self.augmented, out.base, self.screen, alpha,

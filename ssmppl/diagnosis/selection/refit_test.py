@@ -24,14 +24,15 @@ from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.fitting.fit import APPROXIMATELY, Fit
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.run.seeds import Task, child_seed
-from ssmppl.diagnosis.screening.familywise import tail_p
+from ssmppl.diagnosis.screening.efficient_score import Efficient
+from ssmppl.diagnosis.screening.familywise import heights, tail_p
 from ssmppl.diagnosis.screening.screen import Screen, compare_with_null
 from ssmppl.diagnosis.selection.refit import Refit, start_at
 from ssmppl.errors import SSMError
 from ssmppl.inference.run.seeds import random_state
 
-CLOSER_LOOK_FACTOR = 4.0  # times alpha, up to which a closer look is worth it
-TRIED = 2  # candidates refitted in each set, the best by the score
+WORTH_A_TEST = 0.5  # p by the distribution of the scores, up to which the gain's own is simulated
+TRIED = 5  # candidates refitted in each set, the highest on the common scale
 SETS, CHUNK = 99, 10
 SETS_FOR_TAIL = 30  # sets from which their tail is believed
 TAIL_ALPHA_SHARE = 0.1  # of alpha, up to which p by that tail ends the test
@@ -78,8 +79,8 @@ def refit_p(
         if (beyond + 1.0) / (SETS + 1.0) > alpha:
             break
         if beyond == 0 and done >= SETS_FOR_TAIL:
-            heights = np.sqrt(2.0 * np.maximum(gains[np.isfinite(gains)], 0.0))
-            p = tail_p(float(np.sqrt(2.0 * max(gain, 0.0))), heights)
+            simulated = np.sqrt(2.0 * np.maximum(gains[np.isfinite(gains)], 0.0))
+            p = tail_p(float(np.sqrt(2.0 * max(gain, 0.0))), simulated)
             if p <= TAIL_ALPHA_SHARE * alpha:
                 return p
     return (beyond + 1.0) / (done + 1.0)
@@ -113,7 +114,7 @@ def _gain(
         seen = design.statistics(data, passes, stream, checks=False)
         found = compare_with_null(screen.null, screen.typical_squares, seen)
         out = []
-        for j in _best(screen, found.gain, np.array([bool(s) for s in found.status])):
+        for j in _best(screen, found):
             fitter = augmented.fitter((design.candidates[j],))
             start = start_at(fit, screen.design, found, [j])
             again = fitter.fit(data, own, start, APPROXIMATELY)
@@ -123,16 +124,16 @@ def _gain(
     return float(np.max(out, initial=0.0))
 
 
-def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
-    """Columns: the best shape of each of the best groups."""
-    groups, out, seen = screen.groups, [], set()
-    for k in np.argsort(-np.where(silent, -1.0, gain), kind="stable"):
-        if groups[k] not in seen:
-            seen.add(groups[k])
-            out.append(int(k))
-        if len(out) == TRIED:
-            break
-    return out
+def _best(screen: Screen, found: Efficient) -> list[int]:
+    """Columns: the best shape of each of the groups that stand highest on the common scale."""
+    groups, family = screen.groups, screen.family
+    silent = np.array([bool(s) for s in found.status])
+    high = np.where(silent, -np.inf, heights(found.statistic, found.sided))
+    best = [
+        int(m[np.argmax(high[m])]) for m in (np.flatnonzero(groups == g) for g in family.labels)
+    ]
+    order = np.argsort(-family.scale.put(high[best]), kind="stable")[:TRIED]
+    return [best[i] for i in order if not silent[best[i]]]
 
 
 def affordable(augmented: AugmentedModels, experiments: Sequence[Experiment]) -> bool:

@@ -112,11 +112,13 @@ def gaussian_observation(trace: Trace, own: np.ndarray) -> GaussianObservation |
 
 
 class RowsOf:
-    """The rows of a data set as lanes, at one point theta (P,)."""
+    """The rows of a data set as lanes, at points theta (B, P), one after the other."""
 
     def __init__(self, trace: Trace, e: Experiment, theta: np.ndarray):
-        self.count = e.steps
-        self._e, self._theta = e, dict(zip(trace.parameter_symbols, theta, strict=True))
+        self.count = len(theta) * e.steps
+        self._e, self._points = e, len(theta)
+        own = theta[0] if len(theta) == 1 else np.repeat(theta, e.steps, axis=0).T
+        self._theta = dict(zip(trace.parameter_symbols, own, strict=True))
         self._columns: dict[tuple[str, Any], int] = {}
         for kind, symbols in (
             ("observation", trace.observation_symbols), ("input", trace.input_symbols),
@@ -124,29 +126,38 @@ class RowsOf:
             self._columns |= {(kind, s.data[1:]): k for k, s in enumerate(symbols)}
 
     def value(self, symbol: Expr) -> Any:
-        """A number, or (T,)."""
+        """A number, or (B T,)."""
         found = self._theta.get(symbol)
         if found is not None:
             return found
         kind, name, index = symbol.data
         if kind in ("time", "time_prev"):
-            return np.arange(self.count) + (1.0 if kind == "time" else 0.0)
-        base = kind.removesuffix("_prev")
-        column = self._columns["observation" if base == "seen" else base, (name, index)]
-        e = self._e
-        values = {"observation": e.y, "seen": e.seen, "input": e.u}[base][:, column]
-        return np.concatenate([values[:1], values[:-1]]) if kind.endswith("_prev") else values
+            values = np.arange(self._e.steps) + (1.0 if kind == "time" else 0.0)
+        else:
+            base = kind.removesuffix("_prev")
+            column = self._columns["observation" if base == "seen" else base, (name, index)]
+            e = self._e
+            values = {"observation": e.y, "seen": e.seen, "input": e.u}[base][:, column]
+            if kind.endswith("_prev"):
+                values = np.concatenate([values[:1], values[:-1]])
+        return np.tile(values, self._points)
 
     def measured(self) -> tuple[np.ndarray, np.ndarray]:
-        """(T, K) readings, and whether there are any."""
-        return self._e.y, self._e.seen == 1.0
+        """(B T, K) readings, and whether there are any."""
+        return np.tile(self._e.y, (self._points, 1)), np.tile(
+            self._e.seen == 1.0, (self._points, 1)
+        )
 
 
 def predictions_of_rows(
     observation: GaussianObservation, trace: Trace, e: Experiment, theta: np.ndarray,
     mean: np.ndarray, covariance: np.ndarray,
 ) -> Seen:  # fmt: skip
-    """Those of all rows at theta (P,), (T, K) and (T, K, K), from the moments (T, D), (T, D, D)
-    that the states are predicted to have."""
+    """Those of all rows at points theta (B, P), (B, T, K) and (B, T, K, K), from the moments (B, T,
+    D), (B, T, D, D) that the states are predicted to have."""
+    lead, (d,) = mean.shape[:2], mean.shape[2:]
     with np.errstate(all="ignore"):
-        return observation(RowsOf(trace, e, theta), mean, covariance)
+        error, spread = observation(
+            RowsOf(trace, e, theta), mean.reshape(-1, d), covariance.reshape(-1, d, d)
+        )
+    return error.reshape(*lead, -1), spread.reshape(*lead, *spread.shape[1:])

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.codegen.kernels.math.random import fill_normal, uniform
+from ssmppl.codegen.kernels.math.random import uniform
 from ssmppl.codegen.kernels.particle.conditional_smc import ancestral_path, draw_index
 from ssmppl.codegen.kernels.particle.weights import NO_POINT, OK
 from ssmppl.codegen.modules.filter_variants import (
@@ -87,7 +87,7 @@ from ssmppl.inference.preparation.proposal_choice import (
 )
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.seeds import random_state
+from ssmppl.inference.run.seeds import fill_normal, random_state
 
 # Of counted costs, in nanoseconds a row: the guide with Laplace's mode, and a particle that follows
 # it; the spread of log Z that other filters are tuned to, and the fewest particles they take.

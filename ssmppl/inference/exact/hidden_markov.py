@@ -24,7 +24,6 @@ from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.proposals.channels import Channel, channels
 from ssmppl.codegen.kernels.hmm.passes import UNSURE
-from ssmppl.codegen.kernels.math.random import fill_uniform
 from ssmppl.codegen.modules.exact import compile_slopes, compile_tables, exact_entry, varies_by_row
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.codegen.text.kernel_functions import predictive
@@ -37,6 +36,7 @@ from ssmppl.inference.exact.derivatives import Scored
 from ssmppl.inference.exact.histories import Histories, histories
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
 from ssmppl.inference.run.invalid_laws import law_without_density_at
+from ssmppl.inference.run.seeds import fill_uniform
 from ssmppl.language.model.trace import Trace, once_per_trace, previous
 
 ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces

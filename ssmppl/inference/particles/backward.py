@@ -22,7 +22,6 @@ import numpy as np
 
 from ssmppl.analysis.proposals.upper_bounds import transition_upper_bound
 from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.kernels.math.random import fill_uniform
 from ssmppl.codegen.kernels.particle.backward import ABOVE_BOUND
 from ssmppl.codegen.kernels.particle.conditional_smc import JOINING
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, OK
@@ -33,6 +32,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.seeds import fill_uniform
 
 __all__ = [
     "KERNELS",

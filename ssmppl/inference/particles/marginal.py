@@ -25,7 +25,6 @@ import numpy as np
 
 from ssmppl.analysis.density import Term, terms
 from ssmppl.codegen.kernels.kalman.steps import Matrices
-from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
 from ssmppl.codegen.kernels.particle.weights import NAN, OK, summarise
 from ssmppl.codegen.modules.marginal import NAMES, MarginalFilter
 from ssmppl.data import Experiment
@@ -39,6 +38,7 @@ from ssmppl.inference.methods.methods import FFBSi
 from ssmppl.inference.particles.backward import ParticleSystem, draw_particles, pair_failure
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, failure, run_filter
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.seeds import fill_normal, fill_uniform
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.trace import previous, seen
 

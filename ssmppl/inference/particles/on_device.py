@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numba.core.errors import NumbaError
 
-from ssmppl.codegen.kernels.math.random import fill_uniform, new_state, uniform
+from ssmppl.codegen.kernels.math.random import new_state, uniform
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.device import THREADS, cuda_module
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.seeds import fill_uniform
 
 
 def check_device(problem: Problem, proposal: str, **others: tuple[object, object]) -> None:

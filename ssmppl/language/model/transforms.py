@@ -21,7 +21,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
 from ssmppl.language.distributions.positive import LEAST_SHARE
 from ssmppl.language.distributions.vectors.correlations import with_unit_diagonal
-from ssmppl.language.model.trace import Site, Trace
+from ssmppl.language.model.trace import Site, Trace, once_per_trace
 
 ZERO = constant(0.0)
 
@@ -72,9 +72,10 @@ class Transform:
         return np.array([free_number(v, a, b) for v, a, b in pairs])
 
 
-def transforms(trace: Trace) -> list[Transform]:
+@once_per_trace
+def transforms(trace: Trace) -> tuple[Transform, ...]:
     """The transform of each parameter, in the trace's order."""
-    return [_transform(site) for site in trace.parameters.values()]
+    return tuple(_transform(site) for site in trace.parameters.values())
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,18 @@ def fill_uniform(state, out):
     state[2] = start + np.uint64(out.size)
 
 
+@exact
+def normals(state, out):
+    """`fill_normal`, for those who call from Python."""
+    fill_normal(state, out)
+
+
+@exact
+def uniforms(state, out):
+    """`fill_uniform`, for those who call from Python."""
+    fill_uniform(state, out)
+
+
 @precise
 def next_word(state):
     """The next word, uint64."""
