@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Uniform
+from ssmppl.language.model.pickling import UnpackedCache, digest_of, packed, unpacked
 from ssmppl.language.model.trace import Trace
 
 
@@ -37,8 +39,11 @@ class AugmentedModels:
         self.initial_law = initial_law
         self._made: dict[tuple[tuple[str, str], ...], Fitter] = {}
 
-    def __getstate__(self) -> dict:  # another process makes what it needs
-        return {**self.__dict__, "_made": {}}
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process makes what it needs, and keeps it from one stage to the next."""
+        content = packed((self.trace, self.missing, self.fixed, self.settings, self.initial_law))
+        _received.put(digest_of(content), self)
+        return _receive, (content,)
 
     @property
     def base_fitter(self) -> Fitter:
@@ -100,6 +105,13 @@ class AugmentedModels:
         fixed = self.fixed | {n: np.asarray(v) for n, v in given.items()}
         settings = Settings(self.settings.particles, proposal_of(program), self.settings.lag)
         return Fitter(Problem(trace, (), program), fixed, settings, law)
+
+
+_received: UnpackedCache[AugmentedModels] = UnpackedCache(most=4)
+
+
+def _receive(content: bytes) -> AugmentedModels | None:
+    return _received.get(digest_of(content), lambda: AugmentedModels(*unpacked(content)))
 
 
 def range_fraction(shape: str) -> str:

@@ -354,9 +354,9 @@ def when(
     first, last = first[inside], last[inside]
     summed = np.concatenate([np.zeros((sets + 1, 1, width)), np.cumsum(left, axis=1)], axis=1)
     windows = summed[:, last] - summed[:, first]  # (B + 1, windows, D)
-    null = windows[:sets]
-    own = np.einsum("bwi,bwj->wij", null, null) / sets
-    cross = np.einsum("bwi,bj->wij", null, total[:sets]) / sets
+    null = windows[:sets].transpose(1, 2, 0)  # (windows, D, B)
+    own = null @ null.transpose(0, 2, 1) / sets
+    cross = null @ total[:sets] / sets
     whole = total[:sets].T @ total[:sets] / sets
 
     a = np.einsum("bwi,bi->bw", windows, strength)
