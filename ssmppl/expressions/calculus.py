@@ -63,6 +63,14 @@ def _vonmises_density(k: Expr, x: Expr) -> Expr:
     return _f("exp", k * (_f("cos", x) - 1.0)) / (2.0 * math.pi * _f("i0e", k))
 
 
+def _skewnormal_density(a: Expr, z: Expr) -> Expr:
+    return math.sqrt(2.0 / math.pi) * _f("exp", -0.5 * z**2) * _f("ndtr", a * z)
+
+
+def _skewnormal_by_shape(a: Expr, z: Expr) -> Expr:
+    return -_f("exp", -0.5 * z**2 * (1.0 + a**2)) / (math.pi * (1.0 + a**2))
+
+
 PARTIALS: dict[str, Partial] = {
     "neg": lambda d, a: [-1.0],
     "exp": lambda d, a: [d],
@@ -115,6 +123,11 @@ PARTIALS: dict[str, Partial] = {
     "betaincc": lambda d, a, b, x: [None, None, -_beta_density(a, b, x)],
     "vonmises_cdf": lambda d, k, x: [None, _vonmises_density(k, x)],
     "vonmises_quantile": lambda d, k, p: [None, 1.0 / _vonmises_density(k, d)],
+    "skewnormal_cdf": lambda d, a, z: [_skewnormal_by_shape(a, z), _skewnormal_density(a, z)],
+    "skewnormal_quantile": lambda d, a, p: [
+        -_skewnormal_by_shape(a, d) / _skewnormal_density(a, d),
+        1.0 / _skewnormal_density(a, d),
+    ],
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
     "betainccinv": lambda d, a, b, p: [None, None, -1.0 / _beta_density(a, b, d)],
 }

@@ -189,6 +189,8 @@ _TABLE = (
     Operation("betabinomial_quantile", 4, "", "special.betabinomial_quantile"),
     Operation("vonmises_cdf", 2, "", "special.vonmises_cdf"),
     Operation("vonmises_quantile", 2, "", "special.vonmises_quantile"),
+    Operation("skewnormal_cdf", 2, "", "special.skewnormal_cdf"),
+    Operation("skewnormal_quantile", 2, "", "special.skewnormal_quantile"),
 )  # fmt: skip
 OPERATIONS = {o.name: o for o in _TABLE}
 WRITTEN = {o.name: o.written for o in _TABLE if o.written is not None}

@@ -16,6 +16,9 @@ BISECTIONS = 80
 LARGEST_COUNT = 2.0**53
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 PIECES = 6
+_AT = np.arange(-80, 81) / 24.0
+RULE = 0.5 * np.exp(0.5 * np.pi * np.sinh(_AT)) / np.cosh(0.5 * np.pi * np.sinh(_AT))
+RULE_WEIGHTS = np.cosh(_AT) / np.cosh(0.5 * np.pi * np.sinh(_AT)) ** 2 * np.pi / 96.0
 PIVOT = 1e-13  # of a variance, below which what is left of it is taken for rounding
 FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
 
@@ -201,6 +204,48 @@ def vonmises_quantile(concentration: Any, q: Any) -> np.ndarray:
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     sound = (kappa >= 0) & (kappa < np.inf) & (q >= 0) & (q <= 1)
     return np.where(sound, np.where(q <= 0.5, high, -high), np.nan)
+
+
+def _skewnormal_lower(shape: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """P(Z <= z), z <= 0: the part of Owen's function beyond the angle arctan(|shape|), by the rule
+    that the kernels have."""
+    a, h = np.abs(shape)[..., None], -z[..., None]
+    with np.errstate(all="ignore"):
+        last = np.sqrt(a**2 + 2.0 * FARTHEST / h**2)
+        bounded = np.arctan2(2.0 * FARTHEST / (h**2 * (last + a)), 1.0 + last * a)
+        flat = h <= 1e-100  # the integrand is one
+        width = np.where(flat, np.arctan2(1.0, a), bounded)
+        t = np.tan(width * RULE)
+        further = t * (1.0 + a**2) / (1.0 - a * t)  # tan of the angle, less a
+        part = np.exp(-0.5 * h**2 * further * (further + 2.0 * a))
+        part = np.where(flat, 1.0, np.where(further >= 0, part, 0.0))
+        total = np.sum(RULE_WEIGHTS * part, axis=-1)
+        total *= width[..., 0] / np.pi * np.exp(-0.5 * z**2 * (1.0 + shape**2))
+    beyond = np.where(np.isfinite(z), total, 0.0)
+    return np.where(shape >= 0, beyond, 2.0 * sp.ndtr(z) - beyond)
+
+
+def skewnormal_cdf(shape: Any, z: Any) -> np.ndarray:
+    """P(Z <= z) of the density 2 phi(z) Phi(shape z)."""
+    shape, z = _wide(shape, z)
+    tail = _skewnormal_lower(np.where(z <= 0, shape, -shape), -np.abs(z))
+    sound = np.isfinite(shape) & ~np.isnan(z)
+    return np.where(sound, np.where(z <= 0, tail, 1.0 - tail), np.nan)
+
+
+def skewnormal_quantile(shape: Any, q: Any) -> np.ndarray:
+    """z with P(Z <= z) = q, by bisection."""
+    shape, q = _wide(shape, q)
+    negative = q <= skewnormal_cdf(shape, np.zeros(q.shape))
+    turned, p = np.where(negative, shape, -shape), np.where(negative, q, 1.0 - q)
+    low, high = np.full(q.shape, -40.0), np.zeros(q.shape)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        below = _skewnormal_lower(turned, middle) < p
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    found = np.where(q == 0, -np.inf, np.where(q == 1, np.inf, np.where(negative, high, -high)))
+    sound = np.isfinite(shape) & (q >= 0) & (q <= 1)
+    return np.where(sound, found, np.nan)
 
 
 def factor_of_semidefinite(matrices: np.ndarray) -> np.ndarray:

@@ -35,6 +35,8 @@ SMOOTH = {
     "i1e": (sp.i1e, POSITIVE), "betaln": (interpreted.betaln, POSITIVE, POSITIVE),
     "gammaln_rise": (lambda a, b: sp.gammaln(a + b) - sp.gammaln(a), POSITIVE, POSITIVE),
     "digamma_rise": (lambda a, b: sp.digamma(a + b) - sp.digamma(a), POSITIVE, POSITIVE),
+    "skewnormal_cdf": (interpreted.skewnormal_cdf, REAL, REAL),
+    "skewnormal_quantile": (interpreted.skewnormal_quantile, REAL, UNIT),
 }  # fmt: skip
 # Derivatives in the last argument only.
 HALF_SMOOTH = {

@@ -6,6 +6,7 @@ from ssmppl.language.distributions.continuous import (
     HalfFlat,
     LogNormal,
     Normal,
+    SkewNormal,
     Uniform,
     VonMises,
 )
@@ -47,9 +48,9 @@ from ssmppl.language.distributions.vectors.student import MvStudentT
 DISTRIBUTIONS: dict[str, type[Distribution]] = {
     cls.__name__: cls
     for cls in (
-        Normal, MvNormal, LogNormal, StudentT, Laplace, Logistic, Cauchy, HalfNormal, HalfCauchy,
-        Uniform, Exponential, Weibull, Pareto, Gamma, InverseGamma, Beta, VonMises, Dirichlet,
-        Wishart, InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson,
+        Normal, MvNormal, LogNormal, SkewNormal, StudentT, Laplace, Logistic, Cauchy, HalfNormal,
+        HalfCauchy, Uniform, Exponential, Weibull, Pareto, Gamma, InverseGamma, Beta, VonMises,
+        Dirichlet, Wishart, InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson,
         NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical, Multinomial,
         EulerMultinomial, Dirac, Truncated, Censored, Mixture, ZeroInflated, Flat, HalfFlat,
     )

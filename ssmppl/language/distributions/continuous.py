@@ -1,8 +1,9 @@
-"""Normal, LogNormal, Uniform, the improper Flat, and VonMises, elementwise of arrays.
+"""Normal, SkewNormal, LogNormal, Uniform, the improper Flat, and VonMises, elementwise of arrays.
 
 Densities, moments and quantiles as in Johnson, Kotz and Balakrishnan (1994, 1995),
 "Continuous univariate distributions", volumes 1 and 2, in the parametrisations named in each class;
-of VonMises as in Mardia and Jupp (2000), "Directional statistics", section 3.5.4.
+of VonMises as in Mardia and Jupp (2000), "Directional statistics", section 3.5.4, of SkewNormal as
+in Azzalini (1985), "A class of distributions which includes the normal ones".
 """
 
 from __future__ import annotations
@@ -177,6 +178,64 @@ def _log_ndtr_between(low: Any, high: Any) -> ExprArray:
 
 def _all_infinite(a: Any) -> bool:
     return all(e.op == "const" and e.data == -INFINITY for e in array(a).ravel())
+
+
+class SkewNormal(Distribution):
+    """SkewNormal(loc, scale=, shape=): loc + scale Z, Z of density ``2 phi(z) Phi(shape z)``.
+
+    Parameters
+    ----------
+    loc : where the mean would be with shape 0; that is loc + scale d sqrt(2 / pi), where
+        d = shape / sqrt(1 + shape^2).
+    scale : positive; the variance is scale^2 (1 - 2 d^2 / pi).
+    shape : any number: positive for a long right tail, 0 for the normal distribution.
+    """
+
+    def __init__(self, loc: Any, *, scale: Any, shape: Any):
+        self._set(loc=loc, scale=scale, shape_=shape)
+        self._require("scale", 0.0)
+
+    def log_densities(self, value):
+        z = self._z(value)
+        normal = math.log(2.0) - 0.5 * LOG_2PI - ew("log", self.scale) - 0.5 * z**2
+        return normal + ew("log_ndtr", self.shape_ * z)
+
+    def sample(self, draws):  # of two normals correlated by d the one, turned round where the
+        d = self._share()  # other is negative (Azzalini's representation)
+        own, other = self._each(lambda i: draws.normal()), self._each(lambda i: draws.normal())
+        rest = array(ew("sqrt", 1.0 - d**2))
+        return self.loc + self.scale * (d * array(ew("abs", other)) + rest * own)
+
+    def mean(self):
+        return self.loc + self.scale * self._share() * math.sqrt(2.0 / math.pi)
+
+    def variance(self):
+        return self.scale**2 * (1.0 - (2.0 / math.pi) * self._share() ** 2)
+
+    def cdf(self, value):
+        return ew("skewnormal_cdf", self.shape_, self._z(value))
+
+    def survival(self, value):  # of -Z, which has the opposite shape
+        return ew("skewnormal_cdf", -self.shape_, -self._z(value))
+
+    def quantile(self, p):
+        return self.loc + self.scale * ew("skewnormal_quantile", self.shape_, p)
+
+    def survival_quantile(self, p):
+        return self.loc - self.scale * ew("skewnormal_quantile", -self.shape_, p)
+
+    def location_and_scale(self):
+        return self.loc, self.scale
+
+    def noise_free(self):
+        return self.mean()
+
+    def _z(self, value: Any) -> ExprArray:
+        return array((array(value) - self.loc) / self.scale)
+
+    def _share(self) -> ExprArray:
+        """The correlation of the two normals of which Z is made."""
+        return array(self.shape_ / ew("sqrt", 1.0 + self.shape_**2))
 
 
 class LogNormal(Distribution):

@@ -111,7 +111,7 @@ HINTS: dict[str, str] = {
     **dict.fromkeys(["rmultinom", "dmultinom"], "ssm.Multinomial(n, p)"),
     **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
     **dict.fromkeys(
-        ["skewnormal", "skewstudentt", "inversegaussian", "wald", "kumaraswamy",
+        ["skewstudentt", "inversegaussian", "wald", "kumaraswamy",
          "asymmetriclaplace", "exgaussian", "exmodnormal", "genextreme", "generalizedpareto"],
         _OWN,
     ),

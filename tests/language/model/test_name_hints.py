@@ -23,7 +23,7 @@ NAMES = {
     "Poison": "write ssm.Poisson",
     "smaple": "write ssm.sample",
     "NegativeBionmial": "write ssm.NegativeBinomial",
-    "SkewNormal": "write a distribution of your own, by @ssm.distribution",
+    "SkewStudentT": "write a distribution of your own, by @ssm.distribution",
     "PowerLaw": "write ssm.Pareto(shape, scale=)",
     "Potential": "a term of the log density",
     "LKJCholeskyCov": "write ssm.LKJ(dim, eta), a correlation matrix R",
