@@ -375,3 +375,21 @@ def test_an_exact_filter_names_the_law_without_a_density():
     with pytest.raises(ssm.SamplingError, match=r"MvNormal, \[1, 2; 2, 1\], is not positive") as e:
         ssm.kalman_filter(model, {"y": ROWS}, {"c": 2.0})
     assert "c = 2" in str(e.value)
+
+
+@pytest.mark.parametrize("run", [
+    lambda m, y: ssm.maximize(m, y, start={"q": 0.5}, seed=1, progress=False),
+    lambda m, y: ssm.sample(m, y, ssm.PMMH(), draws=100, start={"q": 0.5}, seed=1, progress=False),
+], ids=["maximize", "PMMH"])  # fmt: skip
+def test_an_impossible_row_is_named_where_a_start_was_given(run):
+    """Not "give start=": that was given, and no start makes the row possible."""
+    model = ssm.Model("window")
+    model.prior(lambda: {"q": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, q: {"x": ssm.Normal(x, sd=q)})
+    model.observation(lambda x: {"y": ssm.Uniform(x - 0.1, x + 0.1)})
+    with pytest.raises(ssm.ArgumentError) as caught:
+        run(model, {"y": np.array([0.0, 0.2, 1000.0, 0.1])})
+    assert "all weights are zero at t=3, where y = 1000.; parameters: q = 0.5" in str(caught.value)
+    assert "check the row for an outlier" in caught.value.fix
+    assert "start=" not in caught.value.fix

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.gibbs_updates import (
     GibbsUpdates,
     draw_parameters,
@@ -49,6 +49,7 @@ from ssmppl.inference.preparation.pilot import (
     Pilot,
     averaged_density,
     dispersed,
+    explained,
     find_mode,
     finite_point,
 )
@@ -134,7 +135,10 @@ def _pilot_by_sweeps(
     own = np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 8))
     generator, stream = np.random.default_rng(own), random_state(own)
     density = averaged_density(space, root, kind, 1)
-    z = finite_point(space.z[space.positions], density, generator)
+    try:
+        z = finite_point(space.z[space.positions], density, generator)
+    except ArgumentError as error:
+        raise explained(error, space) from None
     theta, found = space.parameters(z)[0].copy(), []
     for _ in range(SWEEPS):
         draw_parameters(steps, theta, draw_paths(steps, model, theta, stream), generator)

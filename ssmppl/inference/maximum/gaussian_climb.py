@@ -43,7 +43,7 @@ from ssmppl.inference.optimisation.newton import (
     information_by_slope,
 )
 from ssmppl.inference.particles.filtering import log_of_mean
-from ssmppl.inference.preparation.pilot import finite_point
+from ssmppl.inference.preparation.pilot import explained, finite_point
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.seeds import random_state
@@ -290,7 +290,10 @@ class GaussianClimb:
         """The highest top of the starts, and how many there were."""
         given = self.setup.space.z[self.setup.space.positions]
         rng = np.random.default_rng(self.setup.seed(0))
-        start = finite_point(given, self.objective, rng)
+        try:
+            start = finite_point(given, self.objective, rng)
+        except ArgumentError as error:
+            raise explained(error, self.setup.space) from None
         most = FURTHER if self.method.restarts is None else self.method.restarts
         best, k = self._climb(start), 1
         while k <= most:

@@ -15,9 +15,10 @@ import scipy
 
 from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.data import spelled
-from ssmppl.errors import ArgumentError, SamplingError
+from ssmppl.errors import ArgumentError, Location, SamplingError
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
+    full_run,
     log_likelihood_estimate,
     repeated_estimates,
 )
@@ -28,6 +29,7 @@ from ssmppl.inference.run.problem import EXACT, Problem
 from ssmppl.inference.run.seeds import random_state
 
 PILOT_PARTICLES = 200
+LOOKED_AT = 20_000  # particles, in search of a row that none of them can have produced
 TRIES = 200  # random points looked at for one with a finite likelihood
 TUNING_REPEATS = 40
 SCALE_REPEATS = 8
@@ -174,18 +176,36 @@ def averaged_density(
     return averaged
 
 
+def why_zero(
+    problem: Problem, theta: np.ndarray, particles: int | None = LOOKED_AT
+) -> tuple[str, str, Location | None] | None:
+    """What is known of the cause of a likelihood of zero at theta, what to do about it, and where:
+    a distribution that has no density there, or the row at which a bootstrap filter loses its
+    particles; None where neither is found. particles : None: not looked at.
+    """
+    none = law_without_density_at(problem.trace, theta)
+    if none is not None or particles is None:
+        return none
+    stream = random_state(np.random.SeedSequence(0))
+    settings = FilterSettings(particles, "bootstrap")
+    try:
+        for e in problem.experiments:
+            full_run(problem, e, theta, settings, stream, np.empty(0), stream.copy())
+    except SamplingError as error:
+        return error.found, error.fix, None
+    return None
+
+
 def explained(error: ArgumentError, space: Space) -> ArgumentError:
     """The error of `finite_point`, with the distribution that has no density at the space's own
-    point."""
-    none = law_without_density_at(space.problem.trace, space.theta)
-    if none is None:
+    point, or the row that is impossible there."""
+    why = why_zero(space.problem, space.theta)
+    if why is None:
         return error
-    return ArgumentError(
-        f"{error.found}; at the first of them, {spelled(space.problem.trace, space.theta)}, "
-        f"{none[0]}",
-        fix=error.fix,
-        where=none[2],
-    )
+    found, fix, where = why
+    if where is not None:  # what a filter says names the parameters
+        found, fix = f"{spelled(space.problem.trace, space.theta)}, {found}", error.fix
+    return ArgumentError(f"{error.found}; at the first of them, {found}", fix=fix, where=where)
 
 
 def finite_point(

@@ -11,19 +11,19 @@ import numpy as np
 from ssmppl.arguments import checked
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters
-from ssmppl.errors import SamplingError, warn
+from ssmppl.errors import warn
 from ssmppl.inference.gaussian.likelihood import (
     APPROXIMATE,
     approximate_log_likelihood,
     approximation_of,
 )
-from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, full_run
+from ssmppl.inference.particles.filtering import FilterSettings, estimates_task
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood
+from ssmppl.inference.preparation.pilot import why_zero
 from ssmppl.inference.preparation.proposal_choice import resolve_settings
 from ssmppl.inference.run.executors import check_executor
-from ssmppl.inference.run.invalid_laws import law_without_density_at
 from ssmppl.inference.run.problem import EXACT, Problem, pose
-from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.model import Model
 
@@ -149,16 +149,8 @@ def log_likelihood(
 def _say_why_nothing(
     problem: Problem, theta: np.ndarray, settings: FilterSettings | None = None
 ) -> None:
-    """Warn of a likelihood of zero, where something is known of its cause: a distribution that has
-    no density at theta, or the row at which a bootstrap filter loses its particles."""
-    none = law_without_density_at(problem.trace, theta)
-    if none is not None:
-        warn(f"the likelihood is zero: {none[0]}. Fix: {none[1]} ({none[2]})")
-    elif settings is not None:
-        plain = FilterSettings(settings.particles, "bootstrap")
-        stream = random_state(seed_sequence(0))
-        try:
-            for e in problem.experiments:
-                full_run(problem, e, theta, plain, stream, np.empty(0), stream.copy())
-        except SamplingError as error:
-            warn(f"the likelihood is zero: {error.found}. Fix: {error.fix}")
+    """Warn of a likelihood of zero, where something is known of its cause."""
+    why = why_zero(problem, theta, settings.particles if settings else None)
+    if why is not None:
+        found, fix, where = why
+        warn(f"the likelihood is zero: {found}. Fix: {fix}" + (f" ({where})" if where else ""))
