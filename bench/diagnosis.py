@@ -3,7 +3,8 @@
 A driven pendulum with two states of which the angle is measured; the machine has Coulomb friction
 in its joint, the model has none. The first call of each generates its code, into an empty cache;
 the second one finds it there, as the next record of the same machine does. Then the same over
-Dask's LocalCluster of one process and of two, the cache warm, in turns: seconds and their ratio.
+Dask's LocalCluster of one process and of two, in turns: seconds and their ratio, of processes that
+have done a diagnosis before, so that what they import is no part of it.
 
     python bench/diagnosis.py [--rows 200 1000] [--turns 3] [--skip-dask]
 """
@@ -119,7 +120,9 @@ def by_dask(rows: int, turns: int) -> None:
         each = []
         for processes in (1, 2):
             with cluster(processes) as pool:
-                list(pool.map(abs, range(8)))  # the workers are there
+                diagnosed(
+                    200, "fast", pool
+                )  # the workers are there, and have imported what they need
                 each.append(diagnosed(rows, "full", pool)[0])
         taken += [each] * (turn > 0)  # the first turn fills the cache
     gain = [one / two for one, two in taken]
