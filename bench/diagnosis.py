@@ -122,7 +122,7 @@ def by_dask(rows: int, turns: int) -> None:
             with cluster(processes) as pool:
                 diagnosed(
                     200, "fast", pool
-                )  # the workers are there, and have imported what they need
+                )  # there, and all is imported
                 each.append(diagnosed(rows, "full", pool)[0])
         taken += [each] * (turn > 0)  # the first turn fills the cache
     gain = [one / two for one, two in taken]
