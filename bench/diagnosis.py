@@ -120,9 +120,7 @@ def by_dask(rows: int, turns: int) -> None:
         each = []
         for processes in (1, 2):
             with cluster(processes) as pool:
-                diagnosed(
-                    200, "fast", pool
-                )  # there, and all is imported
+                diagnosed(200, "fast", pool)  # there, and all is imported
                 each.append(diagnosed(rows, "full", pool)[0])
         taken += [each] * (turn > 0)  # the first turn fills the cache
     gain = [one / two for one, two in taken]
