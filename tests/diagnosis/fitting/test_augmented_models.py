@@ -1,8 +1,11 @@
 """Models of refits, made once whichever threads ask for them."""
 
+import pickle
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
+from ssmppl.diagnosis.fitting import augmented_models
 from ssmppl.diagnosis.fitting.augmented_models import AugmentedModels
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.smoothing import Settings
@@ -13,13 +16,17 @@ from tests.models import gaps as models
 ROWS, THREADS = 40, 4
 
 
-def test_threads_that_ask_at_once_get_one_model():
+def _posed():
     model, inputs = models.build("oscillator"), models.inputs_of("oscillator", ROWS)
     drawn = models.ssm.simulate(
         model, models.THETA["oscillator"], steps=ROWS, inputs=inputs, seed=1
     )
     problem = pose(model, inputs | {"y": drawn["y"].values[0]})
-    augmented = AugmentedModels(problem.trace, missing_of(problem.experiments), {}, Settings())
+    return problem, AugmentedModels(problem.trace, missing_of(problem.experiments), {}, Settings())
+
+
+def test_threads_that_ask_at_once_get_one_model():
+    problem, augmented = _posed()
     offered, _ = offers(
         problem.trace, scales(problem.trace, ROWS), ["periodic forcing", "constant load"]
     )
@@ -35,3 +42,24 @@ def test_threads_that_ask_at_once_get_one_model():
     for candidates in wanted:
         assert len({id(each[candidates].smoother) for each in found}) == 1
         assert len({id(each[candidates].problem.program) for each in found}) == 1
+
+
+def test_a_process_keeps_what_it_made_for_the_next_stage(monkeypatch):
+    """What is sent again is what was received before, with its fitters; not so with another
+    initial distribution."""
+    _, augmented = _posed()
+    first_stage, second_stage = pickle.dumps(augmented), pickle.dumps(augmented)
+    augmented.initial_law = SimpleNamespace(laws=())
+    changed = pickle.dumps(augmented)
+    monkeypatch.setattr(
+        augmented_models, "_received", augmented_models.UnpackedCache(most=4)
+    )  # another process
+    received = pickle.loads(first_stage)
+    made = received.base_fitter
+    assert received is not augmented
+    again = pickle.loads(second_stage)
+    assert again is received
+    assert again.base_fitter is made
+    other = pickle.loads(changed)
+    assert other is not received
+    assert other.initial_law == augmented.initial_law

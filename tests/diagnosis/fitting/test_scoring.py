@@ -68,6 +68,34 @@ def function_of(problem, space):
     return density_of(space, smooth)
 
 
+def test_many_points_at_once_are_those_one_by_one(posed):
+    """Also where one of them comes to no number, in both data sets."""
+    gaussian = posed.program.gaussian
+    names = [s.data[1] for s in posed.trace.parameter_symbols]
+    at = np.array([[START[n] for n in names], [START[n] * 1.3 for n in names]])
+    at = np.vstack([at, np.where(np.array(names) == "q", np.nan, at[0]), 0.7 * at[1]])
+    values = scoring.increments_with_predictions(posed.trace, gaussian, posed.experiments, 4, 0.25)
+    rows, predicted = values(at)
+    bad = 2
+    assert np.all(rows[bad] == -np.inf)
+    for b in (0, 1, 3):
+        alone, own = values(at[b : b + 1])
+        np.testing.assert_array_equal(rows[b], alone[0])
+        np.testing.assert_array_equal(predicted.error[b], own.error[0])
+        np.testing.assert_array_equal(predicted.covariance[b], own.covariance[0])
+        total = sum(
+            gaussian.extended_log_likelihood(at[b], e.y, e.seen, e.u) for e in posed.experiments
+        )
+        assert rows[b].sum() == pytest.approx(total + 2 * 0.25, rel=1e-12)
+        for e, own_rows in zip(posed.experiments, (slice(0, ROWS), slice(ROWS, None)), strict=True):
+            found = gaussian.extended(at[b], e.y, e.seen, e.u)
+            x, v = found.predicted.T
+            expected = e.y - np.column_stack([x, v + 0.1 * x**2])
+            np.testing.assert_allclose(
+                predicted.error[b, own_rows], np.where(e.seen == 1.0, expected, 0.0), atol=1e-12
+            )
+
+
 def test_the_top_is_newtons(posed):
     space = space_of(posed, {}, {n: np.asarray(v) for n, v in START.items()})
     z = space.z[space.positions]

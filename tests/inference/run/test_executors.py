@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -151,7 +151,7 @@ def test_dask_gives_the_same_diagnosis(client, mode):
 
 SPAWNED = """
 import multiprocessing, sys, warnings
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 import numpy as np
 import ssmppl as ssm
 
@@ -284,6 +284,60 @@ def test_a_function_is_unpickled_once_in_a_process():
     assert [task(1) for task in (first, again, by_digest)] == 3 * [(1, before + 1)]
     assert len(pickle.dumps(sent.task())) > 8 * 10**5
     assert len(pickle.dumps(sent.task(whole=False))) < 500
+
+
+class Elsewhere(Executor):
+    """As of two other processes, but here: it notes how many tasks come at a time."""
+
+    _max_workers = 2
+
+    def __init__(self):
+        self.sizes = []
+
+    def submit(self, fn, /, *args):
+        self.sizes.append(len(args[0]))
+        future = Future()
+        try:
+            future.set_result(fn(*args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def test_quick_tasks_are_sent_several_at_a_time():
+    pool, taken = Elsewhere(), []
+    found = run_tasks(
+        lambda k: 3 * k, range(200), executor=pool, take=lambda k, v: taken.append((k, v))
+    )
+    assert found == [3 * k for k in range(200)]
+    assert sorted(taken) == list(enumerate(found))
+    assert sum(pool.sizes) == 200
+    assert pool.sizes[0] == 1  # nothing is known yet of how long they take
+    assert len(pool.sizes) < 60
+    assert max(pool.sizes) <= 200 // 6  # the last of them would keep others waiting
+
+
+def test_slow_tasks_are_sent_one_by_one(monkeypatch):
+    monkeypatch.setattr("ssmppl.inference.run.tasks.TOGETHER_SECONDS", 0.0)
+    pool = Elsewhere()
+    run_tasks(lambda k: k, range(30), executor=pool)
+    assert pool.sizes == [1] * 30
+
+
+def test_an_error_among_several_is_that_of_its_task():
+    """Those before it in the same submission are kept."""
+    pool, taken = Elsewhere(), []
+
+    def task(k):
+        if k == 137:
+            raise ValueError("no")
+        return k
+
+    with pytest.raises(ValueError, match="no") as caught:
+        run_tasks(task, range(200), executor=pool, take=lambda k, v: taken.append(k))
+    assert caught.value.__notes__ == ["in task 138 of 200"]
+    assert set(taken) >= set(range(137))
+    assert max(pool.sizes) > 1
 
 
 def threads_of_tasks(_=None):
