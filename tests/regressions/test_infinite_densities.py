@@ -393,3 +393,14 @@ def test_an_impossible_row_is_named_where_a_start_was_given(run):
     assert "all weights are zero at t=3, where y = 1000.; parameters: q = 0.5" in str(caught.value)
     assert "check the row for an outlier" in caught.value.fix
     assert "start=" not in caught.value.fix
+
+
+def test_an_impossible_row_is_named_by_the_gaussian_climb():
+    model = ssm.Model("curved")
+    model.prior(lambda: {"q": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, q: {"x": ssm.Normal(np.sin(x), sd=q)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=0.1)})
+    data = {"y": np.array([0.0, 0.1, 1e200, 0.2])}
+    with pytest.raises(ssm.ArgumentError, match=r"zero at t=3, where y = 1\.e\+200"):
+        ssm.maximize(model, data, start={"q": 0.5}, seed=1, progress=False)

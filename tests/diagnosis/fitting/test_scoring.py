@@ -40,10 +40,10 @@ def pendulum(counts=False):
         }  # fmt: skip
 
     @model.observation
-    def observation(x, v, r):
+    def observation(x, v, u, r):
         if counts:
             return {"y": ssm.Poisson(np.exp(x))}
-        return {"y": ssm.Normal(x, sd=r), "w": ssm.Normal(v + 0.1 * x**2, sd=2.0 * r)}
+        return {"y": ssm.Normal(x, sd=r), "w": ssm.Normal(v + 0.1 * x**2 + 0.2 * u, sd=2 * r)}
 
     return model
 
@@ -90,7 +90,7 @@ def test_many_points_at_once_are_those_one_by_one(posed):
         for e, own_rows in zip(posed.experiments, (slice(0, ROWS), slice(ROWS, None)), strict=True):
             found = gaussian.extended(at[b], e.y, e.seen, e.u)
             x, v = found.predicted.T
-            expected = e.y - np.column_stack([x, v + 0.1 * x**2])
+            expected = e.y - np.column_stack([x, v + 0.1 * x**2 + 0.2 * e.u[:, 0]])
             np.testing.assert_allclose(
                 predicted.error[b, own_rows], np.where(e.seen == 1.0, expected, 0.0), atol=1e-12
             )
