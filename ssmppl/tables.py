@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssmppl.arguments import checked
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.results import arviz
 
@@ -29,6 +30,7 @@ __all__ = [
 SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
 
 
+@checked
 def summary(idata: Any, var_names: str | Iterable[str] | None = None) -> pd.DataFrame:
     """Mean, sd, their Monte Carlo errors, bulk and tail ESS, and R-hat; one row per scalar.
 

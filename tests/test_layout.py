@@ -31,7 +31,7 @@ ALLOWED = {layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)}
 ALLOWED["counts"] = {"errors"}
 ALLOWED["data"] = {"counts", "errors", "expressions", "language"}
 ALLOWED["results"] = {"errors"}
-ALLOWED["tables"] = {"errors", "results"}
+ALLOWED["tables"] = {"arguments", "errors", "results"}
 ALLOWED["datasets"] = {"errors"}
 # ... and serve what follows. Adapters make simulators of the language.
 ALLOWED["simulators"] = {"errors", "expressions", "language"}

@@ -202,6 +202,12 @@ def test_summary_of_states_alone_is_empty():
     assert tables.summary(idata).empty
 
 
+def test_summary_says_which_arguments_it_has(idata):
+    with pytest.raises(ArgumentError, match="no argument 'states'") as caught:
+        tables.summary(idata, states=True)
+    assert "var_names" in caught.value.fix
+
+
 def test_summary_of_something_without_posterior_draws():
     filtered = results.to_dataset({"x": np.zeros((1, T))})
     with pytest.raises(ArgumentError, match="summary of a Dataset, which holds no posterior draws"):
