@@ -391,8 +391,8 @@ def test_an_impossible_row_is_named_where_a_start_was_given(run):
     with pytest.raises(ssm.ArgumentError) as caught:
         run(model, {"y": np.array([0.0, 0.2, 1000.0, 0.1])})
     assert "all weights are zero at t=3, where y = 1000.; parameters: q = 0.5" in str(caught.value)
-    assert "check the row for an outlier" in caught.value.fix
-    assert "start=" not in caught.value.fix
+    assert caught.value.fix.startswith("no particle can have produced this row")
+    assert caught.value.fix.endswith("or begin with other values of the parameters (start=)")
 
 
 def test_an_impossible_row_is_named_by_the_gaussian_climb():

@@ -203,6 +203,7 @@ def explained(error: ArgumentError, space: Space) -> ArgumentError:
     if why is None:
         return error
     found, fix, where = why
+    fix += "; or begin with other values of the parameters (start=)"
     if where is not None:  # what a filter says names the parameters
         found, fix = f"{spelled(space.problem.trace, space.theta)}, {found}", error.fix
     return ArgumentError(f"{error.found}; at the first of them, {found}", fix=fix, where=where)

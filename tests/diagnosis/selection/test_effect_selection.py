@@ -486,13 +486,13 @@ def test_every_effect_says_what_naming_it_means():
 
 def test_p_of_every_refit_is_kept_where_none_stands_out(monkeypatch):
     """A break of 10 nats among many dates had p = 1 in the table, that of its score alone."""
-    monkeypatch.setattr(module, "gain_p", lambda screen, r: {0: 0.114, 1: 0.9}[r.index[0]])
+    monkeypatch.setattr(module, "gain_p", lambda screen, r: {0: 0.614, 1: 0.9}[r.index[0]])
     out = SelectionResult(
         None, refits=[replace(refitted("mechanism", 9.0), index=(k,)) for k in (0, 1)]
     )
     choice = EffectSelection(None, None, (), seed_sequence(1), 0.05, Checkpoint(None, {}))
     assert choice._by_refit(out, 0.025) is False
-    assert out.p == {0: 0.114, 1: 0.9}
+    assert out.p == {0: 0.614, 1: 0.9}
 
 
 @pytest.mark.parametrize(
