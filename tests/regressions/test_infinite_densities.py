@@ -404,3 +404,20 @@ def test_an_impossible_row_is_named_by_the_gaussian_climb():
     data = {"y": np.array([0.0, 0.1, 1e200, 0.2])}
     with pytest.raises(ssm.ArgumentError, match=r"zero at t=3, where y = 1\.e\+200"):
         ssm.maximize(model, data, start={"q": 0.5}, seed=1, progress=False)
+
+
+@pytest.mark.parametrize("curved", [False, True])
+def test_no_row_is_blamed_of_an_observation_without_noise(curved):
+    """No particle hits it, possible or not: the first row was named, which is possible."""
+    model = ssm.Model("exact")
+    model.prior(lambda: {"q": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=1)})
+    if curved:
+        model.transition(lambda x, v, q: {"x": ssm.Normal(np.sin(x), sd=q), "v": ssm.Dirac(v)})
+    else:
+        model.transition(lambda x, v, q: {"x": ssm.Normal(x, sd=q), "v": ssm.Dirac(v)})
+    model.observation(lambda x, v: {"y": ssm.Dirac(x), "w": ssm.Dirac(v)})
+    data = {"y": np.array([0.0, 0.1, 0.3]), "w": np.array([0.0, 5.0, 0.0])}
+    with pytest.raises(ssm.ArgumentError, match="points tried for a start") as caught:
+        ssm.sample(model, data, ssm.PMMH(), draws=100, seed=1, progress=False)
+    assert "t=1" not in str(caught.value)

@@ -184,8 +184,8 @@ def why_zero(
     particles; None where neither is found. particles : None: not looked at.
     """
     none = law_without_density_at(problem.trace, theta)
-    if none is not None or particles is None:
-        return none
+    if none is not None or particles is None or problem.program.missing.noise is not None:
+        return none  # particles hit no observation without noise, whatever the row is
     stream = random_state(np.random.SeedSequence(0))
     settings = FilterSettings(particles, "bootstrap")
     try:
