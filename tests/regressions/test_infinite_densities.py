@@ -421,3 +421,7 @@ def test_no_row_is_blamed_of_an_observation_without_noise(curved):
     with pytest.raises(ssm.ArgumentError, match="points tried for a start") as caught:
         ssm.sample(model, data, ssm.PMMH(), draws=100, seed=1, progress=False)
     assert "t=1" not in str(caught.value)
+    if curved:  # "auto" was asked for, and is no fix
+        with pytest.raises(ssm.ArgumentError, match="no proposal applies to this model") as caught:
+            ssm.log_likelihood(model, data, {"q": 0.3}, seed=1)
+        assert "auto" not in caught.value.fix

@@ -128,7 +128,11 @@ def choose_by_pilot(
             n: p for n, p in found_marginal.proposals.items() if not isinstance(p, NotApplicable)
         }
     if not candidates and not last and problem.program.missing.noise is not None:
-        problem.proposal("bootstrap")  # refused, with the row
+        raise ArgumentError(
+            f"no proposal applies to this model: {problem.program.missing.noise}",
+            fix="give the observation some noise; particles are drawn given an exact observation "
+            "where it is affine in states that have noise of their own in that row",
+        )
     if len(candidates) == 1 and not last:
         return Choice(next(iter(candidates)), {})
     flags = whole, integrate, temper, look_ahead
