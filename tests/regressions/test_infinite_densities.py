@@ -413,7 +413,9 @@ def test_no_row_is_blamed_of_an_observation_without_noise(curved):
     model.prior(lambda: {"q": ssm.HalfNormal(sd=1)})
     model.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=1)})
     if curved:
-        model.transition(lambda x, v, q: {"x": ssm.Normal(np.sin(x), sd=q), "v": ssm.Dirac(v)})
+        model.transition(
+            lambda x, v, q: {"x": ssm.Normal(np.sin(x), sd=q), "v": ssm.Uniform(v - 0.1, v + 0.1)}
+        )
     else:
         model.transition(lambda x, v, q: {"x": ssm.Normal(x, sd=q), "v": ssm.Dirac(v)})
     model.observation(lambda x, v: {"y": ssm.Dirac(x), "w": ssm.Dirac(v)})
