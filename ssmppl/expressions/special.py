@@ -16,6 +16,7 @@ BISECTIONS = 80
 LARGEST_COUNT = 2.0**53
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 PIECES = 6
+# Points and weights of the double exponential rule on the unit interval.
 _AT = np.arange(-80, 81) / 24.0
 RULE = 0.5 * np.exp(0.5 * np.pi * np.sinh(_AT)) / np.cosh(0.5 * np.pi * np.sinh(_AT))
 RULE_WEIGHTS = np.cosh(_AT) / np.cosh(0.5 * np.pi * np.sinh(_AT)) ** 2 * np.pi / 96.0

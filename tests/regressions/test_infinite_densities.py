@@ -25,6 +25,7 @@ from ssmppl.inference.chains.interweaving import Collapsed
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.particles.backward import pair_failure
 from ssmppl.inference.particles.filtering import failure
+from ssmppl.inference.preparation import pilot
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.updates.draw_update import draw
@@ -404,6 +405,19 @@ def test_an_impossible_row_is_named_by_the_gaussian_climb():
     data = {"y": np.array([0.0, 0.1, 1e200, 0.2])}
     with pytest.raises(ssm.ArgumentError, match=r"zero at t=3, where y = 1\.e\+200"):
         ssm.maximize(model, data, start={"q": 0.5}, seed=1, progress=False)
+
+
+def test_no_simulator_is_called_in_search_of_a_row(monkeypatch):
+    """Twenty thousand particles would call it in every row."""
+    problem = pose(vector("covariance"), {"y": ROWS})
+    space = SimpleNamespace(problem=problem, theta=np.zeros(0))
+    asked = []
+    monkeypatch.setattr(pilot, "why_zero", lambda _, __, particles: asked.append(particles))
+    error = ssm.ArgumentError("none", fix="start=")
+    assert pilot.explained(error, space) is error
+    monkeypatch.setattr(pilot, "simulators", lambda trace: ("step",))
+    assert pilot.explained(error, space) is error
+    assert asked == [pilot.LOOKED_AT, None]
 
 
 @pytest.mark.parametrize("curved", [False, True])

@@ -174,7 +174,7 @@ class GaussianApproximation:
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
     ) -> FilterMoments | None:
         """What the extended Kalman filter tells; None where it comes to no number."""
-        made = self._followed(theta[None], y, seen, u)
+        made = self.extended_at(theta[None], y, seen, u)
         found = FilterMoments(*(part[0] for part in vars(made).values()))
         return found if found.increments[0] > -np.inf else None
 
@@ -183,11 +183,6 @@ class GaussianApproximation:
     ) -> FilterMoments:
         """The same at points (B, P), with an axis (B,) before the others: where it comes to no
         number the increments are -inf, and the moments zero."""
-        return self._followed(theta, y, seen, u)
-
-    def _followed(
-        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
-    ) -> FilterMoments:
         points, steps = len(theta), len(y)
         found, (after, increments) = self._empty(points, steps)
         arrays = found.x, after, increments, *found.derivatives

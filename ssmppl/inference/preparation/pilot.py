@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from ssmppl.analysis.proposals.proposals import Proposal
+from ssmppl.analysis.structure import simulators
 from ssmppl.data import spelled
 from ssmppl.errors import ArgumentError, Location, SamplingError
 from ssmppl.inference.particles.filtering import (
@@ -29,7 +30,8 @@ from ssmppl.inference.run.problem import EXACT, Problem
 from ssmppl.inference.run.seeds import random_state
 
 PILOT_PARTICLES = 200
-LOOKED_AT = 20_000  # particles, in search of a row that none of them can have produced
+# Particles, and these times rows, in search of a row that none of them can have produced.
+LOOKED_AT, MOST_LOOKED_AT = 20_000, 40_000_000
 TRIES = 200  # random points looked at for one with a finite likelihood
 TUNING_REPEATS = 40
 SCALE_REPEATS = 8
@@ -177,7 +179,7 @@ def averaged_density(
 
 
 def why_zero(
-    problem: Problem, theta: np.ndarray, particles: int | None = LOOKED_AT
+    problem: Problem, theta: np.ndarray, particles: int | None
 ) -> tuple[str, str, Location | None] | None:
     """What is known of the cause of a likelihood of zero at theta, what to do about it, and where:
     a distribution that has no density there, or the row at which a bootstrap filter loses its
@@ -199,13 +201,16 @@ def why_zero(
 def explained(error: ArgumentError, space: Space) -> ArgumentError:
     """The error of `finite_point`, with the distribution that has no density at the space's own
     point, or the row that is impossible there."""
-    why = why_zero(space.problem, space.theta)
+    problem = space.problem
+    particles = max(PILOT_PARTICLES, min(LOOKED_AT, MOST_LOOKED_AT // problem.rows))
+    # a simulator is called for each of them in each row, which may take hours
+    why = why_zero(problem, space.theta, None if simulators(problem.trace) else particles)
     if why is None:
         return error
     found, fix, where = why
     fix += "; or begin with other values of the parameters (start=)"
     if where is not None:  # what a filter says names the parameters
-        found, fix = f"{spelled(space.problem.trace, space.theta)}, {found}", error.fix
+        found, fix = f"{spelled(problem.trace, space.theta)}, {found}", error.fix
     return ArgumentError(f"{error.found}; at the first of them, {found}", fix=fix, where=where)
 
 

@@ -37,7 +37,7 @@ _TINY = 1e-300
 _STEPS = 1_000_000  # of a series or fraction; some 8 sqrt(max(a, b)) of them are needed
 FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
 STEP, NODES = 0.0625, 52  # of the rule, on each side of its middle
-FINE_STEP, FINE_NODES = 1.0 / 24.0, 80
+FINE_STEP, FINE_NODES = 1.0 / 24.0, 80  # likewise, of the skew normal's integral
 
 
 @exact
@@ -641,6 +641,15 @@ def vonmises_cdf(concentration, x):
 
 
 @exact
+def _towards(x, below, slope, p, low, high):
+    """The next point in search of P = p from x, where P is `below`: Newton's for log P, which is
+    nearly straight in the tail, or the middle of the interval where that leads out of it."""
+    known = below > 0.0 and slope > 0.0 and p > 0.0
+    following = x - below / slope * log(below / p) if known else low
+    return following if low < following < high else 0.5 * (low + high)
+
+
+@exact
 def vonmises_quantile(concentration, q):
     """x with P(X <= x) = q: Newton's method, kept inside of an interval that shrinks."""
     if not (0.0 <= concentration < np.inf and 0.0 <= q <= 1.0):
@@ -656,10 +665,7 @@ def vonmises_quantile(concentration, q):
             high = x
         slope = exp(-2.0 * concentration * math.sin(0.5 * x) ** 2)
         slope /= 2.0 * math.pi * i0e(concentration)
-        # of log F, which is nearly straight in the tail
-        following = x - below / slope * log(below / p) if below > 0.0 and p > 0.0 else low
-        if not low < following < high:
-            following = 0.5 * (low + high)
+        following = _towards(x, below, slope, p, low, high)
         if abs(following - x) <= 1e-15 * abs(x) or high - low <= 1e-15 * abs(x):
             x = following
             break
@@ -720,9 +726,7 @@ def skewnormal_quantile(shape, q):
         else:
             high = x
         slope = 2.0 * exp(-0.5 * x * x - _LOG_SQRT_2PI) * ndtr(turned * x)
-        following = x - below / slope * log(below / p) if below > 0.0 and slope > 0.0 else low
-        if not low < following < high:
-            following = 0.5 * (low + high)
+        following = _towards(x, below, slope, p, low, high)
         if abs(following - x) <= 1e-15 * abs(x) or high - low <= 1e-15 * abs(x):
             x = following
             break
