@@ -68,6 +68,7 @@ BY_EXTENDED = (
     "The model calls a simulator: likelihoods, and the states behind the scores, are those of an "
     "extended Kalman filter, which is an approximation."
 )
+LEFT = 0.05  # share of simulated records that leave the domain, from which that is said
 SETS = {"fast": 100, "full": 200}  # simulated data sets; of a simulator 100 in both
 PARTICLES = {"fast": 500, "full": 1000}
 TWISTED_PARTICLES = {"fast": 100, "full": 100}  # a few that know where to go do more
@@ -248,6 +249,12 @@ class _Diagnosis:
         screen = run_screen(
             design, training, fit.theta, self.sets, self._seed(Stage.SCREEN), self.checkpoint
         )
+        if screen.left > LEFT:
+            self.notes.append(
+                f"Of the records simulated from the fitted model, {screen.left:.0%} leave its "
+                "domain (values that are not finite, or far outside the range of the data): "
+                "p-values are conditional on records that stay in it, and simulations may leave it."
+            )
         settings = {
             "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
             "particles": 0 if base.exact else self.settings.particles,

@@ -1,6 +1,7 @@
 """`ssm.diagnose` from end to end, on small data: what it finds, keeps, resumes and refuses."""
 
 import re
+import warnings
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from ssmppl.diagnosis.run.expected_time import Timed, in_words, seconds
 from ssmppl.diagnosis.screening import screen
 from ssmppl.diagnosis.selection import effect_selection, refit
 from ssmppl.errors import ArgumentError, DataError
-from tests.diagnosis.small import BREAK, DATE, level, levels
+from tests.diagnosis.small import BREAK, DATE, fished, fished_data, level, levels
 from tests.models import gaps as models
 
 FEW = 60  # simulated sets, in place of 100 or 200
@@ -258,6 +259,19 @@ def test_any_model_is_screened(case):
     assert report.detection["p"].between(0.0, 1.0).all()
     rows = [len(next(iter(d.values()))) for d in (data if isinstance(data, list) else [data])]
     assert report.settings["samples"] == sum(rows)
+
+
+def test_a_fit_that_mostly_leaves_its_domain_is_screened():
+    """Of a fished stock most simulated records die out: there was no screen at all, and where a few
+    of them had survived until the last rows they alone made every variance."""
+    model, data = fished(), fished_data(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # an overflow among them
+        report = run(model, data, ["constant load", "parameter break", "sensor bias"], mode="fast")
+    assert report.verdict == "no measurable gap"
+    assert not report.causes.empty
+    assert np.isfinite(report.detection["z"]).all()
+    assert any("leave its domain" in note for note in report.notes)
 
 
 # --- errors --------------------------------------------------------------------------------------

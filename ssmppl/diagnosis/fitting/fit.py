@@ -32,7 +32,8 @@ from ssmppl.diagnosis.fitting.noisy_ascent import NEAR, stochastic_quasi_newton
 from ssmppl.diagnosis.fitting.scoring import climb_by_scoring
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
-from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
+from ssmppl.diagnosis.model.simulated_records import Simulator
+from ssmppl.diagnosis.model.smoothing import Pass, Settings, Smoother
 from ssmppl.diagnosis.run.expected_time import timed
 from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError

@@ -33,7 +33,7 @@ from ssmppl.diagnosis.model.equations import Augmented, Equations, Part, as_it_w
 from ssmppl.diagnosis.model.forces import Force, linear, pushed, with_forces
 from ssmppl.errors import ArgumentError, Location, NotApplicable
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import Expr, attributed
+from ssmppl.expressions.expr import Expr, attributed, substitute
 from ssmppl.language.distributions import Distribution, Flat, HalfFlat, Uniform
 from ssmppl.language.model.trace import Site, Trace, symbols
 
@@ -251,21 +251,21 @@ def _replaced(
     trace: Trace, candidates: Sequence[Candidate], equations: Equations,
     names: Mapping[str, dict[str, str]], locations: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
-    """The trace with what acts in place of inputs and parameters."""
+    """The trace with what acts in place of inputs and parameters: what several effects add to an
+    input, and a parameter that one changes after the other, as their factors belong together."""
     out = {}
     for role in ("transition", "observation"):
-        values: dict[Expr, list[Expr]] = defaultdict(list)
+        replacement: dict[Expr, Expr] = {}
         for c in candidates:
             for one in c.each:
                 with attributed(locations, c.effect.where):
-                    changes = bind(one, equations, role, names[_key(c, one)]).changes
-                values[equations.parts[one.equation].seen_from(role)] += changes.values()
-        replacement = {}
-        for s, new in values.items():
-            total = new[0]
-            for other in new[1:]:
-                total = total + (other - s)
-            replacement[s] = total
+                    (new,) = bind(one, equations, role, names[_key(c, one)]).changes.values()
+                    s = equations.parts[one.equation].seen_from(role)
+                    if s in replacement and c.change == "input":
+                        new = replacement[s] + (new - s)
+                    elif s in replacement:
+                        (new,) = substitute([new], {s: replacement[s]})
+                replacement[s] = new
         sites = trace.transition if role == "transition" else trace.observations
         out[role] = {n: _with_law(site, substituted, replacement, locations)
                      for n, site in sites.items()}  # fmt: skip

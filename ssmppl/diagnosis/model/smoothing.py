@@ -1,4 +1,4 @@
-"""One pass over the data: log-likelihood, smoothed scores row by row, predictions; and simulation.
+"""One pass over the data: log-likelihood, smoothed scores row by row, predictions.
 
 A pass (`Smoother`) has exact draws of the trajectories where the model is linear and Gaussian, else
 a particle filter, twisted where the model allows it, with fixed-lag smoothing over its genealogy;
@@ -8,24 +8,17 @@ A model can predict one row well and drift away from reality in ten, as one-step
 corrected by every observation. So the filtered states of some rows are simulated on, and the
 continuous ranked probability score (CRPS) of what they give at each horizon is a statistic like the
 others, whose distribution comes from simulated data sets.
-
-Data sets are drawn from a fitted model (`Simulator`) with the lengths, inputs and gaps of the data.
-A component of x_1 whose distribution is Flat cannot be drawn: it starts at its smoothed mean given
-the data, as does one whose distribution stands for a flat one (`initial_law.py`). What a linear
-Gaussian model with a flat start says of its disturbances does not depend on where it starts (P. de
-Jong, *Annals of Statistics* 19, 1991).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtr
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.modules.filter_variants import compile_row_scores
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.program import Program, compile_trace
@@ -35,7 +28,7 @@ from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.batched.call import OP, gathered, thriftily
-from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.expr import topological
 from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
 from ssmppl.inference.particles.backward import ParticleSystem, particle_system
@@ -43,8 +36,6 @@ from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.seeds import fill_normal, fill_uniform
 from ssmppl.inference.verbs.simulate import feeds_back
-from ssmppl.language.distributions import Dirac, Flat
-from ssmppl.language.model.trace import Site, Trace, symbols
 
 # Of a pass.
 LAG = 40  # rows of the fixed-lag smoother
@@ -417,82 +408,3 @@ def mean_scores(
                 float(known.mean()) if len(known) >= FEWEST else 0.0
             )
     return out
-
-
-class Simulator:
-    """Draws from a model at given parameters.
-
-    program : of the model, which is used as it is where x_1 has a distribution. kalman : of the
-        model where
-    it is linear and Gaussian. held : further states that start at a mean; initial_means : of an
-    experiment and theta (P,), the means (D,) of x_1 that these take.
-    """
-
-    def __init__(
-        self, program: Program, missing: Missing, kalman: object, held: Sequence[str] = (),
-        initial_means: Callable[[Experiment, np.ndarray], np.ndarray] | None = None,
-    ):  # fmt: skip
-        self.trace, self.feedback = program.trace, feeds_back(program.trace)
-        self.initial_means = initial_means
-        flat = [*flat_start(self.trace), *(self.trace.initial[n] for n in held)]
-        self.starts: list[Expr] = [s for site in flat for s in site.components]
-        self.kalman = kalman if isinstance(kalman, KalmanModel) else None
-        self.program = (
-            compile_trace(_with_initial_parameters(self.trace, flat), missing) if flat else program
-        )
-
-    def sets(
-        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
-    ) -> list[Experiment]:
-        """The experiments with observations drawn at theta (P,), missing where theirs are.
-
-        Where a transition reads observations, `y` has those that it read, seen or not.
-        """
-        out = []
-        for e in experiments:
-            drawn = self.observations(e, theta, stream, 1)[:, :, 0]
-            y = drawn if self.feedback else np.where(e.seen == 1.0, drawn, 0.0)
-            out.append(replace(e, y=y))
-        return out
-
-    def observations(
-        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, n: int
-    ) -> np.ndarray:
-        """(T, K, n) drawn with the experiment's inputs, all rows measured."""
-        d, k = len(self.trace.state_symbols), len(self.trace.observation_symbols)
-        at = np.append(theta, self._start(e, theta))
-        run, width = self.program.entry("simulate"), 1 if self.feedback else n
-        drawn = []
-        for _ in range(n // width):
-            x, out = np.empty((e.steps, d, width)), np.empty((e.steps, k, width))
-            run(at, np.zeros_like(e.y), np.ones_like(e.seen), e.u, stream, x, out, self.feedback)
-            drawn.append(out)
-        return np.concatenate(drawn, axis=2)
-
-    def _start(self, e: Experiment, theta: np.ndarray) -> list[float]:
-        if not self.starts:
-            return []
-        place = {s: i for i, s in enumerate(self.trace.state_symbols)}
-        own = theta[: len(self.trace.parameter_symbols)]
-        if self.initial_means is not None:
-            mean = self.initial_means(e, own)
-        elif self.kalman is not None:
-            mean = self.kalman.smooth(e, own).mean[0]
-        else:
-            return []
-        return [float(mean[place[s]]) for s in self.starts]
-
-
-def _with_initial_parameters(trace: Trace, flat: Sequence[Site]) -> Trace:
-    """The trace with flat initial distributions replaced by further parameters."""
-    initial, parameters = dict(trace.initial), dict(trace.parameters)
-    for site in flat:
-        name = f"{site.name}_start"
-        while name in parameters or name in trace.transition:
-            name += "_"
-        at = symbols("parameter", name, site.shape)
-        law, start = Flat(shape=site.shape), Dirac(at)
-        law.location = start.location = site.distribution.location
-        parameters[name] = Site(name, "parameter", law, at, site.distribution.location)
-        initial[site.name] = replace(site, distribution=start)
-    return replace(trace, initial=initial, parameters=parameters)

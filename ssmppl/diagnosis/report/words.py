@@ -238,7 +238,9 @@ def headline(report: Findings) -> str:
         return _none_of_these(report)
     found = leaders(report) or [{"effect": "an unidentified effect", "equation": "", "p": None}]
     groups = [alternatives(report, row) for row in found]
-    sure = p_text(found[0].get("p"))
+    # Of the gap, whichever effect shows it most: the first in the class may be another one.
+    tests = [r["p"] for r in rows(report.causes) if is_number(r["p"])]
+    sure = p_text(min(tests, default=found[0].get("p")))
     unfitted = bool(found[0].get("unfitted"))
     if report.mode == "fast" or unfitted:
         text = f"the score tests indicate a missing effect in {named(report)}: " \

@@ -41,6 +41,7 @@ class Choice(IntEnum):
     OVERLOOKED = 11  # mechanisms that a screen at a strength of zero does not see
     SEARCHED = 14  # what a search found in a larger record
     SEARCHED_SHAPES = 15
+    TESTED = 16  # what gained most in the test of a refit
     OTHER_END = 13  # lags and delays of inputs for those of a sensor, and the other way round
 
 

@@ -21,10 +21,10 @@ from ssmppl.diagnosis.model.basis import BasisTerm, basis, symbolic_shapes
 from ssmppl.diagnosis.model.candidates import Chosen, Refused, offers
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
+from ssmppl.diagnosis.model.simulated_records import REACHES, Simulator, middle_and_range
 from ssmppl.diagnosis.model.smoothing import (
     Pass,
     Settings,
-    Simulator,
     Smoother,
     mean_scores,
     probability_transforms,
@@ -165,7 +165,9 @@ class ScreenDesign:
         found = np.empty(0)
         if checks:
             pits = np.concatenate(probability_transforms(passes, experiments, stream))
-            ahead = [p.ahead for p in passes if p.ahead is not None]
+            # Predictions that leave the domain are as wrong as can be: how far says nothing.
+            most = REACHES[-1] * middle_and_range(experiments)[1]
+            ahead = [np.clip(p.ahead, -most, most) for p in passes if p.ahead is not None]
             found = self._detection(pits, experiments, starts, ahead).values
         return ScreenStatistics(
             rows[:, :p].sum(axis=0),
@@ -216,6 +218,7 @@ class Screen:
 
     observed : means over passes. simulated : (B, ...) of the simulated sets. efficient, family : of
     the candidates, as compared with `null`. typical_squares : (K,) of the columns, of one set.
+    left : share of the records drawn from the fit that left its domain (`Simulator.counted_sets`).
     """
 
     design: ScreenDesign
@@ -227,6 +230,7 @@ class Screen:
     null: Null
     typical_squares: np.ndarray
     experiments: tuple[Experiment, ...]
+    left: float = 0.0
 
     def columns_of(self, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray]:
         """(B, K), (K,) scores of these candidates, simulated and observed; of those among them
@@ -349,8 +353,9 @@ def run_screen(
     family = familywise(
         found.statistic, found.null, sided=found.sided, groups=groups_of(design.candidates)
     )
+    left = 1.0 - len(drawn) / sum(int(s["draws"]) for s in drawn)
     return Screen(
-        design, theta, observed, simulated, found, family, null, typical, tuple(experiments)
+        design, theta, observed, simulated, found, family, null, typical, tuple(experiments), left
     )
 
 
@@ -392,11 +397,11 @@ def _one_set(
     """The statistics of the data (the first `OWN_RUNS`) or of a simulated set; empty where it did
     not go through. theta : of the columns."""
     smoother, stream = design.smoother, random_state(seed, number)
-    data = list(experiments)
+    data, draws = list(experiments), 1
     try:
         if number >= OWN_RUNS:
             own = theta[: len(design.columns.base.parameter_symbols)]
-            data = design.simulator.sets(experiments, own, stream)
+            data, draws = design.simulator.counted_sets(experiments, own, stream)
         passes = smoother.run(data, theta, stream, predicted=checks, ahead=checks)
     except SamplingError:
         if number < OWN_RUNS:
@@ -408,7 +413,7 @@ def _one_set(
         found = design.statistics(data, passes, stream, checks)
     if not np.all(np.isfinite(found.candidate_scores)) or np.any(np.isinf(found.squares)):
         return {}  # rows whose squares are beyond what a number can be
-    return dict(vars(found))
+    return dict(vars(found)) | {"draws": np.asarray(draws)}
 
 
 def compare_with_null(null: Null, typical: np.ndarray, seen: ScreenStatistics) -> Efficient:

@@ -55,7 +55,7 @@ from ssmppl.diagnosis.selection.refit import (
     preferred,
     refit_all,
 )
-from ssmppl.diagnosis.selection.refit_test import WORTH_A_TEST, affordable, gain_p, refit_p
+from ssmppl.diagnosis.selection.refit_test import WORTH_A_TEST, affordable, gain_p, gain_test
 from ssmppl.diagnosis.selection.shapes import shaped_all
 from ssmppl.diagnosis.selection.simulation_fit import SimulationFit, gain_of_base
 from ssmppl.errors import ArgumentError, SSMError
@@ -350,18 +350,34 @@ class EffectSelection:
             return False
         if affordable(self.augmented, self.train):
             anew = one_signed_candidates(self.screen)  # fits to simulated data would take too long
-            rest = {k: p for k, p in found.items() if k not in anew}
+            rest = [p for k, p in found.items() if k not in anew]
             found = {k: p for k, p in found.items() if k in anew}
-            if min(rest.values(), default=1.0) <= WORTH_A_TEST:
-                best = min(rest, key=lambda k: rest[k])
-                found[best] = refit_p(
+            if min(rest, default=1.0) <= WORTH_A_TEST:
+                test = gain_test(
                     self.augmented, out.base, self.screen, alpha,
                     self._seed(Choice.REFIT_TEST), self.checkpoint,
                 )  # fmt: skip
+                if test.p_of(test.gain) <= alpha:
+                    self._refit_tested(out, test.column)
+                found |= {
+                    r.index[0]: test.p_of(r.gain) for r in out.refits if r.index[0] not in anew
+                }
         if not found:
             return False
         out.p |= found
         return min(found.values()) <= alpha
+
+    def _refit_tested(self, out: SelectionResult, column: int | None) -> None:
+        """Refit what gained most in the test, which looks at more of a kind than `leading` does."""
+        groups = {int(self.screen.groups[r.index[0]]) for r in out.refits}
+        if column is None or column < 0 or int(self.screen.groups[column]) in groups:
+            return
+        more, failed = self._refit(
+            out, out.base, self.screen, [[column]], self._seed(Choice.TESTED),
+            "refitting what gained most in the test",
+        )  # fmt: skip
+        out.refits = best_of_groups(self.screen, out.refits + more)
+        out.notes += [f"not refitted: {reason}" for reason in failed]
 
     def _name_what_explains(self, out: SelectionResult) -> None:
         """A cause that was put before what gained more has to simulate as well, or to explain it:

@@ -14,7 +14,9 @@ the data were. That test stops as soon as it cannot reject any more (J. Besag an
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -51,39 +53,68 @@ def gain_p(screen: Screen, refit: Refit) -> float:
     return tail_p(height, screen.family.maxima)
 
 
-def refit_p(
+@dataclass(frozen=True)
+class GainTest:
+    """The largest gain in the data, and those in the simulated sets, all finite.
+
+    column : of the candidate that gains it; None where a fit failed. alpha : of the test.
+    """
+
+    gain: float
+    column: int | None
+    simulated: np.ndarray
+    alpha: float
+
+    def p_of(self, gain: float) -> float:
+        """Family-wise p of a refit that gains so much, no smaller than that of the largest gain: by
+        the sets' count 1 / (sets + 1) at least, smaller by their tail where that is far away."""
+        gain = min(gain, self.gain)
+        beyond = int(np.sum(self.simulated >= gain))
+        if beyond == 0 and len(self.simulated) >= SETS_FOR_TAIL:
+            p = tail_p(_height(gain), _height(self.simulated))
+            if p <= TAIL_ALPHA_SHARE * self.alpha:
+                return p
+        return (beyond + 1.0) / (len(self.simulated) + 1.0)
+
+    @property
+    def decided(self) -> bool:
+        """Whether further sets, `SETS` in all, would change nothing."""
+        beyond = int(np.sum(self.simulated >= self.gain))
+        lost = (beyond + 1.0) / (SETS + 1.0) > self.alpha
+        return lost or self.p_of(self.gain) <= TAIL_ALPHA_SHARE * self.alpha
+
+
+def _height(gain: Any) -> Any:
+    """Of a gain in nats, on the scale of a score's statistic."""
+    return np.sqrt(2.0 * np.maximum(gain, 0.0))
+
+
+def gain_test(
     augmented: AugmentedModels, base: Fit, screen: Screen, alpha: float,
     seed: np.random.SeedSequence, checkpoint: Checkpoint,
-) -> float:  # fmt: skip
-    """p of the largest gain among the `TRIED` best, of the data fitted in the way in which the
-    simulated sets are; by their count 1 / (sets + 1) at least, smaller by their tail.
+) -> GainTest:  # fmt: skip
+    """The test of the largest gain among the `TRIED` best, of the data fitted in the way in which
+    the simulated sets are.
 
     base : the model's fit to the screen's experiments.
     """
-    beyond, done = 0, 0
     seen = checkpoint.computed(
         "the gain that is tested",
-        lambda: {"gain": np.asarray(_gain(augmented, base, screen, screen.experiments, seed, 0))},
+        lambda: _largest(augmented, base, screen, screen.experiments, seed, 0),
     )
-    gain = float(seen["gain"])
-    if not np.isfinite(gain):
-        return 1.0
+    test = GainTest(float(seen["gain"]), int(seen["column"]), np.empty(0), alpha)
+    if not np.isfinite(test.gain):
+        return replace(test, gain=-np.inf, column=None)
     one = partial(_one, augmented, base, screen, seed)
     for last in range(CHUNK, SETS + CHUNK, CHUNK):
         found = checkpoint.map("refitting simulated data", min(last, SETS), one)
         for f in found:
             checkpoint.failures.record_task("a refit of simulated data", f)
         gains = np.array([float(f.get("gain", np.nan)) for f in found])
-        done = int(np.sum(np.isfinite(gains)))
-        beyond = int(np.sum(gains >= gain))
-        if (beyond + 1.0) / (SETS + 1.0) > alpha:
+        test = replace(test, simulated=gains[np.isfinite(gains)])
+        if test.decided:
             break
-        if beyond == 0 and done >= SETS_FOR_TAIL:
-            simulated = np.sqrt(2.0 * np.maximum(gains[np.isfinite(gains)], 0.0))
-            p = tail_p(float(np.sqrt(2.0 * max(gain, 0.0))), simulated)
-            if p <= TAIL_ALPHA_SHARE * alpha:
-                return p
-    return (beyond + 1.0) / (done + 1.0)
+    return test
 
 
 def _one(
@@ -96,14 +127,15 @@ def _one(
         data = design.simulator.sets(screen.experiments, given, stream)
     except SSMError:
         return {"gain": np.asarray(np.nan)}
-    return {"gain": np.asarray(_gain(augmented, base, screen, data, seed, k + 1))}
+    return _largest(augmented, base, screen, data, seed, k + 1)
 
 
-def _gain(
+def _largest(
     augmented: AugmentedModels, base: Fit, screen: Screen, data: Sequence[Experiment],
     seed: np.random.SeedSequence, k: int,
-) -> float:  # fmt: skip
-    """The largest gain in one data set; NaN where a fit failed."""
+) -> Numbers:  # fmt: skip
+    """The largest gain in one data set, at least 0, and whose it is (its column); NaN and -1 where
+    a fit failed."""
     design, plain = screen.design, augmented.base_fitter
     stream = random_state(seed, Task.TEST_SCORES, k)
     own = child_seed(seed, Task.TEST_FIT, k)
@@ -113,15 +145,16 @@ def _gain(
         passes = design.smoother.run(data, at, stream, predicted=False)
         seen = design.statistics(data, passes, stream, checks=False)
         found = compare_with_null(screen.null, screen.typical_squares, seen)
-        out = []
+        gain, column = 0.0, -1
         for j in _best(screen, found):
             fitter = augmented.fitter((design.candidates[j],))
             start = start_at(fit, screen.design, found, [j])
             again = fitter.fit(data, own, start, APPROXIMATELY)
-            out.append(again.log_likelihood - fit.log_likelihood)
+            if again.log_likelihood - fit.log_likelihood > gain:
+                gain, column = again.log_likelihood - fit.log_likelihood, j
     except SSMError:
-        return float("nan")
-    return float(np.max(out, initial=0.0))
+        gain, column = np.nan, -1
+    return {"gain": np.asarray(gain), "column": np.asarray(column)}
 
 
 def _best(screen: Screen, found: Efficient) -> list[int]:

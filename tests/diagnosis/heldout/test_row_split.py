@@ -7,7 +7,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import bind
 from ssmppl.diagnosis.heldout.row_split import FOLDS, GAP, folds, long_enough, three_parts, without
-from ssmppl.diagnosis.model.smoothing import Simulator
+from ssmppl.diagnosis.model.simulated_records import Simulator
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state

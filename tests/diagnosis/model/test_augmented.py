@@ -7,18 +7,22 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.analysis.density import Missing
+from ssmppl.data import bind as bind_data
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.basis import basis
 from ssmppl.diagnosis.model.binding import bind
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.equations import Augmented, Equations, as_it_was
 from ssmppl.diagnosis.model.initial_law import ProperInitialLaw
+from ssmppl.diagnosis.model.score_columns import score_columns
+from ssmppl.diagnosis.model.smoothing import Settings, Smoother
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.language.distributions import Normal
 from ssmppl.language.tracing import trace
 from tests.diagnosis.every import candidates, different, traced
 from tests.diagnosis.harness import content, differences, scales
-from tests.diagnosis.small import level
+from tests.diagnosis.small import fished, fished_data, level
 
 
 def named(where, name, effect, equation):
@@ -55,6 +59,28 @@ def test_an_input_that_another_effect_changed_is_still_the_input():
     assert not different(after, augment(t, [friction, saturated]))
     increments = [c for c in after.added if c.strength == friction.strength]
     assert increments == [friction]
+
+
+def test_two_changes_of_one_parameter_are_one_after_the_other():
+    """Added to each other, the second one was a difference that is zero where a score is taken, and
+    the score of its strength was infinite times zero."""
+    t = trace(fished())
+    names = ["parameter drift", "parameter break"]
+    drift, jump = (
+        next(c for c in offers(t, scales(t, 64), [n])[0] if c.equation == "K") for n in names
+    )
+    one = augment(t, [replace(drift, shape=(("rows", 64.0),))])
+    both = augment(one, [jump])
+    columns = score_columns(one, both, [jump.strength], (), Missing())
+    places = {repr(s): i for i, s in enumerate(columns.nuisance)}
+    assert (list(places), columns.names) == (
+        ["r", "K", "q", "s", drift.strength], (jump.strength,)
+    )  # fmt: skip
+    data, theta = bind_data(t, fished_data(1)), np.array([0.3, 800.0, 0.1, 0.1, -0.7])
+    (found,) = Smoother(columns, Missing(), Settings(200)).run(data, theta, np.ones(4, np.uint64))
+    after = np.arange(64) >= dict(jump.shape)["date"]
+    expected = np.where(after, 800.0 * found.rows[:, places["K"]], 0.0)
+    np.testing.assert_allclose(found.rows[:, -1], expected, rtol=1e-9)
 
 
 def test_auxiliary_states_keep_their_names_and_places():

@@ -14,10 +14,10 @@ from ssmppl.diagnosis.fitting.augmented_models import proposal_of
 from ssmppl.diagnosis.fitting.fit import Fitter
 from ssmppl.diagnosis.heldout.predictions import stretches
 from ssmppl.diagnosis.model.score_columns import score_columns
+from ssmppl.diagnosis.model.simulated_records import Simulator
 from ssmppl.diagnosis.model.smoothing import (
     PREDICTIVE,
     Settings,
-    Simulator,
     Smoother,
     probability_transforms,
 )

@@ -8,7 +8,8 @@ import ssmppl as ssm
 from ssmppl.data import bind, check_parameters
 from ssmppl.diagnosis.fitting.fit import Effort, Fitter
 from ssmppl.diagnosis.model.scales import Scales
-from ssmppl.diagnosis.model.smoothing import Settings, Simulator
+from ssmppl.diagnosis.model.simulated_records import Simulator
+from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.errors import ArgumentError, SamplingError

@@ -31,7 +31,7 @@ from ssmppl.diagnosis.selection.refit import (
     other_noise_laws,
     preferred,
 )
-from ssmppl.diagnosis.selection.refit_test import gain_p
+from ssmppl.diagnosis.selection.refit_test import GainTest, gain_p
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence
@@ -493,6 +493,30 @@ def test_p_of_every_refit_is_kept_where_none_stands_out(monkeypatch):
     choice = EffectSelection(None, None, (), seed_sequence(1), 0.05, Checkpoint(None, {}))
     assert choice._by_refit(out, 0.025) is False
     assert out.p == {0: 0.614, 1: 0.9}
+
+
+@pytest.mark.parametrize(("simulated", "found"), [(np.linspace(0, 8, 99), True), ([10.0], False)])
+def test_what_gained_most_in_the_test_is_refitted(monkeypatch, simulated, found):
+    """The test looks at more candidates of a kind than are refitted to begin with: what it finds
+    was never named, and its p was that of another one."""
+    monkeypatch.setattr(module, "gain_p", lambda screen, r: 0.1)
+    monkeypatch.setattr(module, "affordable", lambda *_: True)
+    monkeypatch.setattr(module, "one_signed_candidates", lambda _: [])
+    test = GainTest(9.0, 2, np.array(simulated), 0.025)
+    monkeypatch.setattr(module, "gain_test", lambda *_: test)
+    asked = []
+
+    def refit_all(augmented, base, screen, sets, *_, **__):
+        asked.append(sets)
+        return [replace(refitted("change in time", 9.2), index=(2,))], []
+
+    monkeypatch.setattr(module, "refit_all", refit_all)
+    monkeypatch.setattr(module, "best_of_groups", lambda screen, refits: refits)
+    screen = SimpleNamespace(groups=np.array([0, 0, 1]))
+    out = SelectionResult(None, refits=[refitted("mechanism", 6.0)])
+    assert choice_of(screen)._by_refit(out, 0.025) is found
+    assert asked == [[[2]]] * found
+    assert out.p == ({0: test.p_of(6.0), 2: 0.01} if found else {0: 1.0})
 
 
 @pytest.mark.parametrize(
