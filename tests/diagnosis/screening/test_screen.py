@@ -118,7 +118,7 @@ def test_too_few_sets_is_said(monkeypatch):
     def fails(self, *args):
         raise SamplingError("all weights are zero at t=3")
 
-    monkeypatch.setattr(Simulator, "sets", fails)
+    monkeypatch.setattr(Simulator, "counted_sets", fails)
     theta = check_parameters(problem.trace, THETA)
     with pytest.raises(ArgumentError, match="0 of 60 parametric-bootstrap data sets") as error:
         run_screen(design, problem.experiments, theta, 60, seed_sequence(1), Checkpoint(None, {}))
