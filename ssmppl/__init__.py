@@ -94,6 +94,7 @@ from ssmppl.language.model import model as _model
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
+from ssmppl.language.user_defined.potential import Potential
 from ssmppl.language.user_defined.primitive import primitive
 from ssmppl.language.user_defined.sde import SDE
 from ssmppl.language.user_defined.simulator import Simulator, simulator
@@ -194,6 +195,7 @@ __all__ = [
     "Pareto",
     "ParticleEM",
     "Poisson",
+    "Potential",
     "SSMError",
     "SamplingError",
     "ScoreAscent",

@@ -169,11 +169,14 @@ def _bind(
     observed = {}
     for name, site in trace.observations.items():
         labels = trace.component_names.labels(name)
-        if need or holds(source, name, site.shape, labels):
+        if not site.distribution.measured:
+            _check_no_column(source, site, labels)
+        elif need or holds(source, name, site.shape, labels):
             observed[name] = channel(source, name, site.shape, "observation", labels)
     rows = _rows(source, {**observed, **inputs}, steps)
     for name, site in trace.observations.items():
-        observed.setdefault(name, np.full((rows, *site.shape), np.nan))
+        given = need and not site.distribution.measured  # a term of the density: in every row
+        observed.setdefault(name, np.full((rows, *site.shape), 0.0 if given else np.nan))
     _check_inputs(source, inputs)
     u = _input_array(trace, inputs, rows, number)
     env = dict(zip(trace.input_symbols, u.T, strict=True))
@@ -195,7 +198,7 @@ def _bind(
         time=source.time,
         steps=rows,
         partial=frozenset(partial),
-        observed={n: observed[n] for n in trace.observations},
+        observed={n: observed[n] for n, s in trace.observations.items() if s.distribution.measured},
         inputs=inputs,
         zone=source.zone,
         label=source.experiment,
@@ -203,6 +206,19 @@ def _bind(
 
 
 # -- checks over rows
+def _check_no_column(source: Source, site: Site, labels: Any) -> None:
+    """A term of the log density has no data."""
+    if holds(source, site.name, site.shape, labels):
+        kind = type(site.distribution).__name__
+        raise DataError(
+            f"{site.name!r} is a {kind}, a term of the log density, and the {source.kind} has a "
+            "column of that name",
+            fix="leave the column out, or give its values another name and declare them as an "
+            "input that the term reads",
+            where=source.place(),
+        )
+
+
 def _rows(source: Source, values: dict[str, np.ndarray], steps: int | None) -> int:
     """The number of rows, which all variables share."""
     lengths = {n: len(v) for n, v in values.items()}

@@ -130,6 +130,15 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
             "ssm.Truncated",
             where=where,
         )
+    if role != "observation" and not distribution.measured:
+        raise ModelError(
+            f"the distribution of {name!r} is {kind}, a term of the log density, which stands in "
+            "the place of an observation",
+            fix="return it from @observation, where it may be of parameters and states: "
+            f"{{{name!r}: ssm.{kind}(...)}}; a term of the first row alone is "
+            "np.where(t == 1, term, 0)",
+            where=where,
+        )
     allowed = role == "prior" or (role == "initial" and kind == "Flat")
     if not distribution.proper and not allowed:
         raise ModelError(

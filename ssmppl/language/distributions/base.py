@@ -144,6 +144,7 @@ class Distribution:
     closed = False  # whether the lower bound itself belongs to the support
     open_above = False  # whether the upper one does not
     drawable = True  # whether it has a sampler
+    measured = True  # whether it is of a value that data have; a potential is not
     guards_range = False  # whether its density has to know where a parameter is out of range
     symmetric = False  # whether values are symmetric matrices, whose two halves share symbols
     unit_diagonal = False  # whether they have a diagonal of ones

@@ -139,7 +139,7 @@ HINTS: dict[str, str] = {
         ["softmaxnormal", "logitnormalmultivariate", "additivelogisticnormal"],
         "ssm.LogisticNormal(mean, covariance=), shares of sum 1",
     ),
-    **dict.fromkeys(["potential", "factor"], "a term of the log density as " + _OWN),
+    "factor": "ssm.Potential(log_density) in @observation",
     **dict.fromkeys(
         ["tobit", "clipped", "detectionlimit", "leftcensored", "rightcensored"],
         "ssm.Censored(dist, lower=, upper=)",

@@ -25,7 +25,7 @@ NAMES = {
     "NegativeBionmial": "write ssm.NegativeBinomial",
     "SkewStudentT": "write a distribution of your own, by @ssm.distribution",
     "PowerLaw": "write ssm.Pareto(shape, scale=)",
-    "Potential": "a term of the log density",
+    "factor": "write ssm.Potential(log_density)",
     "LKJCholeskyCov": "write ssm.LKJ(dim, eta), a correlation matrix R",
     "lkj_corr": "write ssm.LKJ(dim, eta)",
     "lkj": "write ssm.LKJ",
