@@ -226,7 +226,8 @@ def _estimates(
 ) -> np.ndarray | SamplingError:
     theta, seed = piece
     try:
-        settings = FilterSettings(particles, choose_by_pilot(problem, theta, exact=False).name)
+        chosen = choose_by_pilot(problem, theta, exact=False, temper=True).name
+        settings = FilterSettings(particles, chosen)
         return repeated_estimates(problem, theta, settings, seed, range(repeats))
     except SamplingError as error:
         return error

@@ -190,9 +190,8 @@ def local_maximum(
     settings = None
     if isinstance(setup.exact, NotApplicable):
         theta, _ = setup.space.parameters(z)
-        settings = FilterSettings(
-            method.particles, choose_by_pilot(setup.problem, theta.copy(), exact=False).name
-        )
+        chosen = choose_by_pilot(setup.problem, theta.copy(), exact=False, temper=True).name
+        settings = FilterSettings(method.particles, chosen)
     scale = scales(setup, settings, z)
     runs = int(np.clip(np.ceil(noise**2 / NOISE), 2, MOST_RUNS)) if settings else 1
     search = _Search(setup, settings, np.array(z), np.diag(scale), runs)

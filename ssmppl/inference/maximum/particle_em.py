@@ -57,7 +57,7 @@ def climb(setup: Maximization, method: ParticleEM) -> Ascent:
     theta = setup.space.parameters(setup.start)[0]
     proposal = method.proposal
     if proposal == "auto":
-        proposal = choose_by_pilot(problem, theta, exact=False).name
+        proposal = choose_by_pilot(problem, theta, exact=False, temper=True).name
     problem.proposal(proposal)
     settings = FilterSettings(int(method.particles), proposal)
     each = -(-method.trajectories // method.runs)

@@ -98,7 +98,7 @@ def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
     theta, _ = setup.space.parameters(start)
     proposal = method.proposal
     if proposal == "auto":
-        proposal = choose_by_pilot(setup.problem, theta, exact=False, whole=True).name
+        proposal = choose_by_pilot(setup.problem, theta, exact=False, whole=True, temper=True).name
     settings = resolve_settings(setup.problem, theta, counts["particles"], proposal)
     kernel, why = choose_kernel(
         setup.problem, settings, counts["trajectories"], method.kernel,

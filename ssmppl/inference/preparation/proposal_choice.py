@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.proposals.proposals import Proposal
-from ssmppl.codegen.kernels.particle.resampling import SYSTEMATIC
 from ssmppl.codegen.modules.marginal import MarginalFilter
 from ssmppl.codegen.text.module import PARTICLE, level_of
 from ssmppl.codegen.text.render import depends, is_small_power
@@ -212,6 +211,11 @@ def _beginning(problem: Problem) -> Problem:
     return replace(problem, experiments=short)
 
 
+def tempers(resampling: str, ess_threshold: float, rescue: int) -> bool:
+    """Whether a filter with these settings can be tempered."""
+    return resampling == "systematic" and ess_threshold >= 1.0 and not rescue
+
+
 def resolve_settings(
     problem: Problem,
     theta: np.ndarray,
@@ -236,8 +240,8 @@ def resolve_settings(
     if device != "cpu":
         return _on_device(problem, theta, settings, resampling, device)
     if proposal == "auto":
-        fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
-        flags = {"whole": whole, "integrate": integrate, "temper": temper and fixed}
+        temper = temper and tempers(resampling, ess_threshold, rescue)
+        flags = {"whole": whole, "integrate": integrate, "temper": temper}
         chosen = choose_by_pilot(problem, theta, **flags).name
         return replace(settings, proposal=chosen)
     if proposal in EXACT:

@@ -264,7 +264,10 @@ def _with_filter(
         theta, _ = space.parameters(find_mode(space, root, rescue=method.rescue).z)
         if proposal == "auto":
             plain = method.order == 0  # filters with scores know all states, and no guide
-            choice = choose_by_pilot(problem, theta, exact=False, whole=plain, integrate=plain)
+            choice = choose_by_pilot(
+                problem, theta, exact=False, whole=plain, integrate=plain,
+                temper=plain and not method.rescue,
+            )  # fmt: skip
             proposal = choice.name
         problem.proposal(proposal, integrate=method.order == 0)
         if particles is None:

@@ -17,7 +17,8 @@ from ssmppl.analysis.structure import simulators
 from ssmppl.arguments import checked
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.data.times import label_text
+from ssmppl.errors import ArgumentError, NotApplicable, warn
 from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.state_values import probabilities
@@ -25,7 +26,7 @@ from ssmppl.inference.gaussian.likelihood import APPROXIMATE, approximation_of
 from ssmppl.inference.gaussian.moments import ApproximateKalman
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, full_run
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
-from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings, tempers
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import (
     by_experiment,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+FEW, MANY = 3.0, 20  # effective sample size that is no sample, where there are so many particles
 
 
 @checked
@@ -111,13 +113,19 @@ def particle_filter(
     ------
     SamplingError : all weights vanish at some step, with `rescue` those of all that were drawn;
         names the step, the row and the parameters.
+
+    A row at which the effective sample size is below 3 is warned of.
     """
     check_executor(executor)
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
     check_count("repeats", repeats, 1)
-    if proposal == "auto":
-        proposal = choose_by_pilot(problem, theta, exact=False, integrate=not history).name
+    chosen = proposal == "auto"
+    if chosen:
+        temper = not history and tempers(resampling, ess_threshold, rescue)
+        proposal = choose_by_pilot(
+            problem, theta, exact=False, integrate=not history, temper=temper
+        ).name
     if history and is_marginal(proposal):
         raise ArgumentError(
             f'history=True with proposal="{proposal}", whose particles are of some states only',
@@ -145,7 +153,8 @@ def particle_filter(
 
     task = partial(_one_run, problem, theta, settings, levels, root, history)
     runs = run_tasks(task, list(range(repeats)), executor=executor)
-    attrs = {
+    warned = _degeneracy(problem, runs, particles, chosen)
+    attrs = warned | {
         **model_attributes(problem.trace), "particles": particles, "proposal": settings.proposal,
         "resampling": "multinomial" if rescue else resampling, "ess_threshold": ess_threshold,
         "rescue": rescue, "seed": str(root.entropy),
@@ -169,6 +178,37 @@ def _one_run(
         run(problem, e, theta, settings, rng, levels, apart)
         for e, (rng, apart) in zip(problem.experiments, streams, strict=True)
     ]
+
+
+def _degeneracy(
+    problem: Problem, runs: list[list[FilterRun]], particles: int, chosen: bool
+) -> dict[str, Any]:
+    """What goes to the attributes: nothing, or the warning of a row that next to no particle
+    reaches, which is also given.
+
+    chosen : whether the proposal was chosen for the model.
+    """
+    ess = [np.concatenate([run[i].ess for i in range(len(problem.experiments))]) for run in runs]
+    least = np.min(ess, axis=0)
+    bad = np.flatnonzero(least < FEW)
+    if particles < MANY or not len(bad):
+        return {}
+    worst, which = int(bad[np.argmin(least[bad])]), 0
+    row = worst
+    while row >= problem.experiments[which].steps:
+        row, which = row - problem.experiments[which].steps, which + 1
+    e = problem.experiments[which]
+    label = "" if e.time is None else f" (time {label_text(e.time[row])})"
+    where = f" of experiment {which + 1}" if len(problem.experiments) > 1 else ""
+    others = f", and below {FEW:.0f} at {len(bad) - 1} other rows" if len(bad) > 1 else ""
+    fix = "Use more particles" if chosen else 'Use more particles, or proposal="auto"'
+    text = (
+        f"particle degeneracy at t={row + 1}{label}{where}: an effective sample size of "
+        f"{least[worst]:.1f} of {particles} particles{others}; the moments and quantiles there are "
+        f"those of next to no particles, and the log-likelihood varies much. {fix}"
+    )
+    warn(text)
+    return {"filter_warning": text}
 
 
 def filter_dataset(

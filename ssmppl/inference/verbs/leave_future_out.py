@@ -285,7 +285,7 @@ def _increments(
     settings = None
     if isinstance(exact_model(problem.trace), NotApplicable):
         middle = np.median(flat, axis=0)
-        chosen = choose_by_pilot(problem, middle, exact=False, integrate=True).name
+        chosen = choose_by_pilot(problem, middle, exact=False, integrate=True, temper=True).name
         settings = FilterSettings(particles, chosen)
     pieces = [p for p in np.array_split(np.arange(len(flat)), TASKS) if len(p)]
     task = partial(_some_increments, problem, flat, settings, root)

@@ -235,7 +235,7 @@ def _log_likelihood(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) 
     if not isinstance(setup.exact, NotApplicable):
         return setup.exact.log_likelihood(problem.experiments, theta)
     try:
-        settings = FilterSettings(PARTICLES, choose_by_pilot(problem, theta).name)
+        settings = FilterSettings(PARTICLES, choose_by_pilot(problem, theta, temper=True).name)
         task = estimates_task(problem, theta, settings, setup.seed(1))
         pieces = [range(r, r + 1) for r in range(REPEATS)]
         log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
@@ -298,7 +298,7 @@ def _information(setup: Maximization, theta: np.ndarray, found: Edges | None) ->
     try:
         scores = complete_scores(setup.problem, setup.fixed)
         settings = FilterSettings(
-            PARTICLES, choose_by_pilot(setup.problem, theta, exact=False).name
+            PARTICLES, choose_by_pilot(setup.problem, theta, exact=False, temper=True).name
         )
         smoothing = Smoothing(settings, TRAJECTORIES)
         runs = several_runs(

@@ -146,7 +146,7 @@ def score(
         )
     check_count("repeats", repeats, 2)
     check_count("trajectories", trajectories, 1)
-    settings = resolve_settings(problem, theta, particles, proposal, whole=True)
+    settings = resolve_settings(problem, theta, particles, proposal, whole=True, temper=True)
     root = seed_sequence(seed)
     attrs: dict[str, Any] = model_attributes(problem.trace) | {"fixed": dict(fixed or {})}
     form = exact_model(problem.trace)

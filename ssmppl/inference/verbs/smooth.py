@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.arguments import checked_with
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
@@ -41,7 +42,11 @@ from ssmppl.inference.particles.fixed_lag import LAG, collapse, distinct, lag_mo
 from ssmppl.inference.particles.marginal import is_marginal, marginal_paths, may_integrate
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.method_choice import choose_smoother
-from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
+from ssmppl.inference.preparation.proposal_choice import (
+    choose_by_pilot,
+    resolve_settings,
+    tempers,
+)
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.invalid_laws import total_of
@@ -65,7 +70,6 @@ if TYPE_CHECKING:
 
 PARTICLES, TRAJECTORIES = 1000, 1000
 PGAS_WARMUP = 100  # sweeps that are dropped
-COLLAPSED = 'Use more particles, proposal="twisted", or method=ssm.PGAS().'
 
 
 @dataclass(frozen=True)
@@ -196,15 +200,16 @@ def _filter(
             f'{type(method).__name__}(proposal="{proposal}") has no particles',
             fix=f"use {exact.get(proposal, '')}another proposal",
         )
+    rescue = method.rescue if isinstance(method, FFBSi) else 0
     if proposal == "auto":
         proposal = choose_by_pilot(
             setup.problem, setup.theta, exact=False, whole=isinstance(method, FFBSi),
-            integrate=integrate,
+            integrate=integrate, temper=tempers(method.resampling, method.ess_threshold, rescue),
         ).name  # fmt: skip
     n = PARTICLES if setup.particles is None else setup.particles
     settings = resolve_settings(
         setup.problem, setup.theta, n, proposal, method.resampling, method.ess_threshold,
-        method.rescue if isinstance(method, FFBSi) else 0, integrate=integrate,
+        rescue, integrate=integrate,
     )  # fmt: skip
     longest = max(e.steps for e in setup.problem.experiments)
     each = len(setup.problem.trace.state_symbols) + 2  # with weight and ancestor
@@ -244,9 +249,18 @@ def by_ffbsi(setup: SmoothingSetup, method: FFBSi) -> list[SmoothedStates]:
         }  # fmt: skip
         over_time = {"distinct": distinct(paths), "ess": system.ess}
         if not marginal:
-            report |= collapse(over_time["distinct"], system, draws, e, COLLAPSED)
+            report |= collapse(over_time["distinct"], system, draws, e, _remedy(setup, settings))
         out.append(SmoothedStates(report, paths=paths, over_time=over_time))
     return out
+
+
+def _remedy(setup: SmoothingSetup, settings: FilterSettings) -> str:
+    """What to do where few distinct particles are left: proposals that were derived alone."""
+    fixes = ["more particles"]
+    twisted = setup.problem.program.proposals.get("twisted")
+    if settings.proposal != "twisted" and isinstance(twisted, Proposal):
+        fixes.append('proposal="twisted"')
+    return f"Use {', '.join(fixes)}{',' * (len(fixes) > 1)} or method=ssm.PGAS()."
 
 
 def by_fixed_lag(setup: SmoothingSetup, method: FixedLag) -> list[SmoothedStates]:
@@ -271,7 +285,7 @@ def by_fixed_lag(setup: SmoothingSetup, method: FixedLag) -> list[SmoothedStates
         moments = m.mean, m.covariance, m.cross, m.quantiles
         over_time = {"distinct": m.distinct, "ess": system.ess}
         n = settings.particles
-        report |= collapse(m.distinct, system, n, e, COLLAPSED)
+        report |= collapse(m.distinct, system, n, e, _remedy(setup, settings))
         out.append(SmoothedStates(report, moments=moments, over_time=over_time))
     return out
 

@@ -1,0 +1,98 @@
+"""Rows that next to no particle of a filter reaches are told, and others are not."""
+
+import functools
+import warnings
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+import ssmppl as ssm
+
+AT = {"q": 0.1}
+
+
+def precise(sd):
+    model = ssm.Model("a precise sensor")
+    model.prior(lambda: {"q": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, q: {"x": ssm.StudentT(4, x, scale=q)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=sd)})
+    return model
+
+
+def y(rows=8):
+    return np.cumsum(0.1 * np.random.default_rng(3).standard_normal(rows))
+
+
+@pytest.mark.parametrize("experiments", [1, 2])
+def test_a_row_with_one_particle_is_told(experiments):
+    tame = {"y": np.full(5, np.nan)}
+    data = {"y": y(), "time": np.arange("2020-01", "2020-09", dtype="datetime64[M]")}
+    given = data if experiments == 1 else [tame, {"y": y()}]
+    with pytest.warns(UserWarning, match="particle degeneracy at t=") as said:
+        found = ssm.particle_filter(
+            precise(1e-6), given, AT, particles=100, proposal="bootstrap", seed=1
+        )
+    text = str(said[0].message)
+    last = found[-1] if experiments == 2 else found
+    row = int(last["ess"].argmin("time").item())
+    assert f"t={row + 1} " in text
+    assert f"of {float(last['ess'].min()):.1f} of 100 particles" in text
+    assert f"below 3 at {int((last['ess'] < 3).sum()) - 1} other rows" in text
+    assert ("of experiment 2" in text) is (experiments == 2)
+    assert ("(time 2020-" in text) is (experiments == 1)
+    assert text.endswith('proposal="auto"')
+    assert last.attrs["filter_warning"] == text
+
+
+def test_what_is_fine_is_not():
+    """By default a filter that is tempered looks at rows that the transition does not reach."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = ssm.particle_filter(precise(1e-6), {"y": y()}, AT, particles=100, seed=1)
+        few = ssm.particle_filter(
+            precise(1e-6), {"y": y()}, AT, particles=10, proposal="bootstrap", seed=1
+        )
+        ssm.particle_filter(
+            precise(0.1), {"y": y()}, AT, particles=100, proposal="bootstrap", seed=1
+        )
+    assert found.attrs["proposal"] == "tempered"
+    assert "filter_warning" not in found.attrs
+    assert "filter_warning" not in few.attrs
+
+
+@functools.cache
+def exact(q):
+    """log p(y) of the transitions between the rows, which the sensor leaves next to no doubt of."""
+    at = np.array([0.0, *y()])
+    steps = stats.t(4, scale=q).logpdf(np.diff(at)[1:]).sum()
+    return float(stats.norm(0, 1).logpdf(at[1]) + steps)
+
+
+def test_every_verb_takes_a_proposal_that_reaches_the_rows():
+    """Filter, smoother, score and maximum rested on one particle, with a log-likelihood of minus
+    three hundred thousand."""
+    model, data = precise(1e-6), {"y": y()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        smoothed = ssm.smooth(model, data, AT, seed=1)
+        score = ssm.score(model, data, AT, seed=1)
+        runs = ssm.particle_filter(model, data, AT, repeats=8, seed=1)
+        best = ssm.maximize(model, data, seed=1)
+    spread = smoothed["x"].std("trajectory").to_numpy() / 1e-6
+    np.testing.assert_allclose(spread, 1.0, atol=0.15)
+    total = runs["log_likelihood_increment"].sum("time").to_numpy()
+    error = total.std(ddof=1) / np.sqrt(len(total))
+    assert total.mean() + 0.5 * total.var() == pytest.approx(exact(0.1), abs=5 * error)
+    error = score.log_likelihood_error
+    assert score.log_likelihood == pytest.approx(exact(0.1), abs=5 * error)
+    by = 1e-5
+    slope = (exact(0.1 + by) - exact(0.1 - by)) / (2 * by)
+    assert score.gradient["q"] == pytest.approx(slope, abs=5 * score.gradient_errors["q"] + 1e-3)
+    q = optimize.minimize_scalar(
+        lambda q: -exact(q), bounds=(0.01, 0.5), method="bounded"
+    ).x  # fmt: skip
+    assert best.parameters["q"] == pytest.approx(q, rel=0.01)
+    error = best.attrs["log_likelihood_error"]
+    assert best.log_likelihood == pytest.approx(exact(q), abs=5 * error)
