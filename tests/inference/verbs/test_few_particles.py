@@ -70,17 +70,18 @@ def exact(q):
     return float(stats.norm(0, 1).logpdf(at[1]) + steps)
 
 
-def test_every_verb_takes_a_proposal_that_reaches_the_rows():
+@pytest.mark.parametrize("sd", [1e-6, 1e-8])
+def test_every_verb_takes_a_proposal_that_reaches_the_rows(sd):
     """Filter, smoother, score and maximum rested on one particle, with a log-likelihood of minus
-    three hundred thousand."""
-    model, data = precise(1e-6), {"y": y()}
+    three hundred thousand; at 1e-8 no first temperature was small enough."""
+    model, data = precise(sd), {"y": y()}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         smoothed = ssm.smooth(model, data, AT, seed=1)
         score = ssm.score(model, data, AT, seed=1)
         runs = ssm.particle_filter(model, data, AT, repeats=8, seed=1)
         best = ssm.maximize(model, data, seed=1)
-    spread = smoothed["x"].std("trajectory").to_numpy() / 1e-6
+    spread = smoothed["x"].std("trajectory").to_numpy() / sd
     np.testing.assert_allclose(spread, 1.0, atol=0.15)
     total = runs["log_likelihood_increment"].sum("time").to_numpy()
     error = total.std(ddof=1) / np.sqrt(len(total))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import special
+from scipy import special, stats
 
 import ssmppl as ssm
 from ssmppl import datasets
@@ -233,11 +233,25 @@ def test_runs_that_few_of_count_are_said(recwarn):
     model.observation(lambda x, precision: {"y": ssm.Normal(x, sd=precision)})
     data = {"y": np.array([0.0, *[np.nan] * 10, 3.0])}
 
-    def scored(sd):
+    def scored(sd, proposal):
         given = data | {"precision": np.full(12, sd)}
-        return ssm.score(model, given, {"s": 0.5}, seed=1, particles=500, repeats=8)
+        return ssm.score(
+            model, given, {"s": 0.5}, seed=1, particles=500, repeats=8, proposal=proposal
+        )
 
-    scored(0.5)
+    scored(0.5, "bootstrap")
+    found = scored(1e-8, "auto")  # tempered
     assert not recwarn.list
+    error = found.log_likelihood_error
+    assert found.log_likelihood == pytest.approx(log_density_of_the_last(3.0, 0.5), abs=5 * error)
     with pytest.warns(UserWarning, match="the 8 runs have a standard deviation of .*bootstrap"):
-        scored(1e-3)
+        scored(1e-3, "bootstrap")
+
+
+def log_density_of_the_last(y, s):
+    """Of the sum of eleven steps, by their characteristic function, with the first row's at 0."""
+    h = 0.01
+    x = np.arange(-30_000, 30_000) * h
+    step = np.fft.fft(np.fft.ifftshift(stats.t(4, scale=s).pdf(x))) * h
+    total = np.real(np.fft.fftshift(np.fft.ifft(step**11))) / h
+    return float(np.log(np.interp(y, x, total)) + stats.norm.logpdf(0.0))

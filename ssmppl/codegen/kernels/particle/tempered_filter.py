@@ -35,8 +35,8 @@ from ssmppl.codegen.kernels.particle.weights import (
 KEPT = (
     0.5  # of the particles that are alive, as effective sample size, from one temperature to next
 )
-HALVINGS = 14  # of the interval, in logarithms, in which the next temperature is looked for
-SMALLEST = -30.0  # log of the smallest step in temperature
+HALVINGS = 16  # of the interval, in logarithms, in which the next temperature is looked for
+SMALLEST = -100.0  # log of the smallest step in temperature
 ACCEPTANCE = 0.3  # that the walk adapts to in the pilot run
 GAIN = 1.0  # of the log scale, for an acceptance rate that is off by 1
 
