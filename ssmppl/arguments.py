@@ -94,6 +94,7 @@ OF_ONE_DISTRIBUTION: dict[str, dict[str, str]] = {
     "Beta": dict.fromkeys(("mu", "mean", "kappa", "phi", "nu"), _BETA_OF_MEAN),
     "BetaBinomial": dict.fromkeys(("mu", "mean", "kappa", "phi", "nu"), _BETA_OF_MEAN),
     "Dirichlet": dict.fromkeys(("a", "alphas"), "concentration="),
+    "Skellam": {"mu1": "rate1=", "mu2": "rate2="},
     "Exponential": {
         **dict.fromkeys(("mu", "mean", "theta"), "scale="),
         "beta": "rate=, or scale= where beta is NumPy's, the mean",

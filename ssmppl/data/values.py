@@ -208,9 +208,9 @@ def outside(
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     low, high = lower[index], upper[index]
     if support.kind == "integers":
-        bounds = f"the whole numbers from {number(low)}" + (
-            f" to {number(high)}" if math.isfinite(high) else ""
-        )
+        first = f" from {number(low)}" if math.isfinite(low) else ""
+        last = f" {'to' if first else 'up to'} {number(high)}" if math.isfinite(high) else ""
+        bounds = f"the whole numbers{first}{last}"
     else:
         left, right = "[" if closed else "(", ")" if distribution.open_above else "]"
         left, right = left if math.isfinite(low) else "(", right if math.isfinite(high) else ")"

@@ -128,6 +128,17 @@ PARTIALS: dict[str, Partial] = {
         -_skewnormal_by_shape(a, d) / _skewnormal_density(a, d),
         1.0 / _skewnormal_density(a, d),
     ],
+    # of P(k) = P(N1 - N2 = k): dP / da = P(k - 1) - P(k), dP / db = P(k + 1) - P(k)
+    "skellam_log_mass": lambda d, k, a, b: [
+        None,
+        _f("expm1", _f("skellam_log_mass", k - 1.0, a, b) - d),
+        _f("expm1", _f("skellam_log_mass", k + 1.0, a, b) - d),
+    ],
+    "skellam_cdf": lambda d, k, a, b: [
+        None,
+        -_f("exp", _f("skellam_log_mass", _f("floor", k), a, b)),
+        _f("exp", _f("skellam_log_mass", _f("floor", k) + 1.0, a, b)),
+    ],
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
     "betainccinv": lambda d, a, b, p: [None, None, -1.0 / _beta_density(a, b, d)],
 }

@@ -191,6 +191,9 @@ _TABLE = (
     Operation("vonmises_quantile", 2, "", "special.vonmises_quantile"),
     Operation("skewnormal_cdf", 2, "", "special.skewnormal_cdf"),
     Operation("skewnormal_quantile", 2, "", "special.skewnormal_quantile"),
+    Operation("skellam_log_mass", 3, "", "skellam.skellam_log_mass"),
+    Operation("skellam_cdf", 3, "", "skellam.skellam_cdf"),
+    Operation("skellam_quantile", 3, "", "skellam.skellam_quantile"),
 )  # fmt: skip
 OPERATIONS = {o.name: o for o in _TABLE}
 WRITTEN = {o.name: o.written for o in _TABLE if o.written is not None}

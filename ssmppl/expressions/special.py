@@ -6,6 +6,7 @@ The compiled kernels (`codegen/kernels/math/special.py`) compute the same by oth
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +23,7 @@ RULE = 0.5 * np.exp(0.5 * np.pi * np.sinh(_AT)) / np.cosh(0.5 * np.pi * np.sinh(
 RULE_WEIGHTS = np.cosh(_AT) / np.cosh(0.5 * np.pi * np.sinh(_AT)) ** 2 * np.pi / 96.0
 PIVOT = 1e-13  # of a variance, below which what is left of it is taken for rounding
 FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
+UNIFORM, SUMMED = 100.0, 1e8  # sizes of Bessel functions, where their expansion begins and sums end
 
 
 def _wide(*values: Any) -> list[np.ndarray]:
@@ -247,6 +249,166 @@ def skewnormal_quantile(shape: Any, q: Any) -> np.ndarray:
     found = np.where(q == 0, -np.inf, np.where(q == 1, np.inf, np.where(negative, high, -high)))
     sound = np.isfinite(shape) & (q >= 0) & (q <= 1)
     return np.where(sound, found, np.nan)
+
+
+def _deviance_part(x: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """x log(x / mean) + mean - x for x >= 0, mean > 0, without cancellation near x = mean (C.
+    Loader, *Fast and accurate computation of binomial probabilities*, 2000)."""
+    v = (x - mean) / (x + mean)
+    near = (x - mean) * v
+    for j in range(1, 11):
+        near = near + 2.0 * x * v ** (2 * j + 1) / (2 * j + 1)
+    return np.where(np.abs(v) < 0.1, near, sp.xlogy(x, x / mean) + mean - x)
+
+
+# Numerators, from the highest power of p^2 on, and denominators of U_k(p) / p^k, DLMF 10.41.9.
+DEBYE = [
+    ([-5.0, 3.0], 24.0),
+    ([385.0, -462.0, 81.0], 1152.0),
+    ([-425425.0, 765765.0, -369603.0, 30375.0], 414720.0),
+    ([185910725.0, -446185740.0, 349922430.0, -94121676.0, 4465125.0], 39813120.0),
+    (
+        [-188699385875.0, 566098157625.0, -614135872350.0, 284499769554.0, -49286948607.0,
+         1519035525.0],
+        6688604160.0,
+    ),
+    (
+        [1023694168371875.0, -3685299006138750.0, 5104696716244125.0, -3369032068261860.0,
+         1050760774457901.0, -127577298354750.0, 2757049477875.0],
+        4815794995200.0,
+    ),
+]  # fmt: skip
+
+
+def _skellam_total(k: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """A + B of the counts A - B = k, A B = a b, the likeliest ones where N1 - N2 = k."""
+    return np.hypot(k, 2.0 * np.sqrt(a) * np.sqrt(b))
+
+
+def _skellam_exponent(k: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(log(A / a), the exponent of the masses of A and B), for k >= 0."""
+    up = 0.5 * (k + _skellam_total(k, a, b))
+    down = b * (a / up)
+    tilt = np.log(up / a)
+    # what rounding of A and B makes of their difference, to first order
+    gap = np.where(up <= 2.0 * k, (up - k) - down, (up - down) - k)
+    rest = np.where(down > 0, _deviance_part(down, b), b)
+    return tilt, tilt * gap - _deviance_part(up, a) - rest
+
+
+def skellam_log_mass(k: Any, a: Any, b: Any) -> np.ndarray:
+    """log P(N1 - N2 = k) for Poisson counts of rates a and b: the power series of the Bessel
+    function in it, or DLMF 10.41.3."""
+    k, a, b = _wide(k, a, b)
+    sound = (a >= 0) & (a < np.inf) & (b >= 0) & (b < np.inf) & ~np.isnan(k)
+    a, b, k = np.where(k < 0, b, a), np.where(k < 0, a, b), np.abs(k)
+    with np.errstate(all="ignore"):
+        m = _skellam_total(k, a, b)
+        few, product = m < UNIFORM, np.where(m < UNIFORM, a * b, 0.0)
+        term, total, j = np.ones(m.shape), np.ones(m.shape), 0
+        while np.any(term > 1e-17 * total):
+            j += 1
+            term = term * product / (j * (k + j))
+            total = total + term
+        series = sp.xlogy(k, a) - sp.gammaln(k + 1.0) - a - b + np.log(total)
+        factor, x = np.ones(m.shape), (k / m) ** 2
+        for power, (top, below) in enumerate(DEBYE, start=1):
+            factor = factor + np.polyval(top, x) / below / m**power
+        exponent = _skellam_exponent(k, a, b)[1]
+        uniform = exponent - 0.5 * np.log(2.0 * np.pi * m) + np.log(factor)
+        found = np.where(few, series, uniform)
+    found = np.where((k == np.inf) | ((a == 0) & (k > 0)), -np.inf, found)
+    return np.where(sound, found, np.nan)
+
+
+def _skellam_outwards(k: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """P(N1 - N2 >= k) over P(N1 - N2 = k), k >= max(0, a - b): the sum, by the ratios of its terms
+    from the far end on."""
+    most = float(np.max(_skellam_total(k, a, b), initial=0.0))
+    total, ratio = np.ones(k.shape), np.zeros(k.shape)
+    for j in range(math.ceil(FARTHEST + math.sqrt(FARTHEST**2 + 2.0 * FARTHEST * most)), 0, -1):
+        ratio = a / (k + j + b * ratio)
+        total = 1.0 + ratio * total
+    return total
+
+
+def _skellam_approximate(k: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """P(N1 - N2 <= k) of large rates: Lugannani and Rice's formula (*Adv. Appl. Prob.* 12, 1980)
+    for whole numbers."""
+    m, turned = _skellam_total(k, a, b), k > 0
+    a, b = np.where(turned, a, b), np.where(turned, b, a)
+    tilt, exponent = _skellam_exponent(np.abs(k), a, b)
+    tilt = np.where(turned, -tilt, tilt)  # of -(N1 - N2) >= -k
+    w = np.copysign(np.sqrt(np.maximum(-2.0 * exponent, 0.0)), tilt)
+    limit = 0.5 / np.sqrt(m) + k / (6.0 * m * np.sqrt(m))
+    away = -1.0 / (np.expm1(-tilt) * np.sqrt(m)) - 1.0 / w
+    # near the mean the difference of two reciprocals has fewer digits than its limit
+    correction = np.where(np.abs(w) < 1e-5 * np.sqrt(m), limit, away)
+    density = np.exp(exponent) / math.sqrt(2.0 * math.pi)
+    return np.clip(sp.ndtr(-w) + correction * density, 0.0, 1.0)
+
+
+def _skellam_lower(k: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """P(N1 - N2 <= k) for k < a - b."""
+    large = _skellam_total(k, a, b) > SUMMED
+    out = np.where(large, _skellam_approximate(k, a, b), 0.0)
+    mass = np.exp(skellam_log_mass(k, a, b))
+    here = ~large & (mass > 0)
+    k, a, b, mass = k[here], a[here], b[here], mass[here]
+    i = np.maximum(k, 0.0)  # down to 0 by the ratios the other way round
+    ratio = np.exp(skellam_log_mass(i + 1.0, a, b) - skellam_log_mass(i, a, b))
+    term, total = np.ones(k.shape), np.zeros(k.shape)
+    while np.any(going := (i > 0) & (term > 1e-18 * total)):
+        total = np.where(going, total + term, total)
+        back = np.where(going, (i + b * ratio) / a, 1.0)
+        term, ratio, i = term * back, 1.0 / back, i - going
+    rest = np.where(i > 0, 0.0, term * _skellam_outwards(np.maximum(-k, 0.0), b, a))
+    out[here] = np.minimum(mass * (total + rest), 1.0)
+    return out
+
+
+def skellam_cdf(k: Any, a: Any, b: Any) -> np.ndarray:
+    """P(N1 - N2 <= k): below the mean to full relative accuracy, above it one less the rest."""
+    k, a, b = _wide(k, a, b)
+    sound = (a >= 0) & (a < np.inf) & (b >= 0) & (b < np.inf) & ~np.isnan(k)
+    k, a, b = np.where(sound, np.floor(k), 0.0), np.where(sound, a, 0.0), np.where(sound, b, 0.0)
+    below, finite = k < a - b, np.isfinite(k)
+    at = np.where(finite, np.where(below, k, -k - 1.0), -1.0)
+    with np.errstate(all="ignore"):
+        tail = _skellam_lower(at, np.where(below, a, b), np.where(below, b, a))
+    found = np.where(finite, np.where(below, tail, 1.0 - tail), k > 0)
+    return np.where(sound, found, np.nan)
+
+
+def skellam_quantile(a: Any, b: Any, q: Any) -> np.ndarray:
+    """The smallest k with P(N1 - N2 <= k) >= q; -inf for q = 0 unless b is 0."""
+    a, b, q = _wide(a, b, q)
+    sound = (a >= 0) & (a < np.inf) & (b >= 0) & (b < np.inf) & (q >= 0) & (q <= 1)
+    inner = sound & (q > 0) & (q < 1)
+    a_in, b_in, p = np.where(inner, a, 0.0), np.where(inner, b, 0.0), np.where(inner, q, 0.5)
+
+    def reached(k: np.ndarray) -> np.ndarray:
+        return skellam_cdf(k, a_in, b_in) >= p
+
+    high = np.floor(a_in - b_in + np.sqrt(a_in + b_in) * sp.ndtri(p))
+    low, step = high - 1.0, 1.0
+    while np.any(short := ~reached(high)):
+        low, high = np.where(short, high, low), np.where(short, high + step, high)
+        step *= 2.0
+    step = 1.0
+    while np.any(beyond := reached(low)):
+        low, high = np.where(beyond, low - step, low), np.where(beyond, low, high)
+        step *= 2.0
+    while True:
+        middle = np.floor(0.5 * (low + high))
+        between = (low < middle) & (middle < high)
+        if not np.any(between):
+            break
+        inside = reached(middle)
+        low = np.where(between & ~inside, middle, low)
+        high = np.where(between & inside, middle, high)
+    least, most = np.where(b > 0, -np.inf, 0.0), np.where(a > 0, np.inf, 0.0)
+    return np.where(sound, np.where(q == 0, least, np.where(q == 1, most, high)), np.nan)
 
 
 def factor_of_semidefinite(matrices: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ssmppl.language.distributions as D
-from ssmppl.codegen.kernels.math import elementary, random, scalars, special
+from ssmppl.codegen.kernels.math import elementary, random, scalars, skellam, special
 from ssmppl.codegen.kernels.math.flags import Kernel, exact, kernel
 from ssmppl.codegen.text.module import Layout, Section, Target
 from ssmppl.codegen.text.render import PHRASES, is_small_power
@@ -61,7 +61,8 @@ NAMESPACE = {
     "np": np, "inf": np.inf, "nan": np.nan, "exact": exact, "kernel": kernel,
     "maximum": scalars.maximum, "abs": abs,
 }  # fmt: skip
-MODULES = {m.__name__.rpartition(".")[2]: m for m in (elementary, scalars, special, random)}
+FILES = (elementary, scalars, skellam, special, random)
+MODULES = {m.__name__.rpartition(".")[2]: m for m in FILES}
 NAMESPACE |= {n: getattr(MODULES[f], n) for n, f in KERNELS.items() if f != "random"}
 
 

@@ -50,6 +50,8 @@ HALF_SMOOTH = {
     "betaincinv": (sp.betaincinv, POSITIVE, POSITIVE, UNIT),
     "vonmises_cdf": (interpreted.vonmises_cdf, POSITIVE, (-2, 2)),
     "vonmises_quantile": (interpreted.vonmises_quantile, POSITIVE, UNIT),
+    "skellam_log_mass": (interpreted.skellam_log_mass, ABOVE1, POSITIVE, POSITIVE),
+    "skellam_cdf": (interpreted.skellam_cdf, REAL, POSITIVE, POSITIVE),
 }
 KINKED = {
     "abs": (np.abs, REAL), "sign": (np.sign, REAL), "floor": (np.floor, REAL),
@@ -87,7 +89,7 @@ def _symbolic(name: str, args: list[Expr]) -> Expr:
 
 def _near_a_jump(name: str, values: list[np.ndarray]) -> bool:
     """Whether rounding could change the branch taken."""
-    if name in ("floor", "ceil"):
+    if name in ("floor", "ceil", "skellam_cdf"):
         distance = values[0] - np.round(values[0])
     elif name == "mod":
         distance = values[0] / values[1] - np.round(values[0] / values[1])

@@ -28,7 +28,7 @@ SYMBOLS = [X, Y, Z]
 NO_DERIVATIVE = {
     "poisson_quantile", "binomial_quantile", "negbinomial_quantile", "trigamma",
     "betabinomial_cdf", "betabinomial_quantile",
-    "poisson_survival_quantile", "negbinomial_survival_quantile",
+    "poisson_survival_quantile", "negbinomial_survival_quantile", "skellam_quantile",
 }  # fmt: skip
 
 

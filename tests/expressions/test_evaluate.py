@@ -15,7 +15,7 @@ from tests.expressions.graphs import TABLE, X, Y, Z, programs, run
 OTHERS = {
     "eq", "ne", "poisson_quantile", "binomial_quantile", "negbinomial_quantile",
     "poisson_survival_quantile", "negbinomial_survival_quantile",
-    "betabinomial_cdf", "betabinomial_quantile",
+    "betabinomial_cdf", "betabinomial_quantile", "skellam_quantile",
 }  # fmt: skip
 
 

@@ -1,4 +1,5 @@
-"""Likelihoods and posteriors of mixtures, inflated counts, lifetimes and headings against grids.
+"""Likelihoods and posteriors of mixtures, inflated counts, differences of counts, lifetimes and
+headings against grids.
 
 The grids' densities are SciPy's; estimates are held against them within their Monte Carlo errors.
 """
@@ -54,6 +55,7 @@ absent = declared(
 scattered = declared(
     "scattered", lambda x: {"y": ssm.BetaBinomial(10, np.exp(x), 2.0)}
 )  # fmt: skip
+differences = declared("differences", lambda x: {"y": ssm.Skellam(np.exp(1 + x), 2.0)})
 lifetimes = declared("lifetimes", lambda x: {"y": ssm.Weibull(1.7, scale=np.exp(x))})
 headings = declared(
     "headings", lambda x: {"y": ssm.VonMises(x, concentration=1.5)},
@@ -68,6 +70,14 @@ def weibull(y):
 
 def inflated(y, p):
     return p * (y[:, None] == 0) + (1 - p) * st.poisson.pmf(y[:, None], np.exp(1 + X))
+
+
+def subtracted(y):
+    """The sum over the second count."""
+    second = np.arange(40)
+    first = y[:, None, None] + second[:, None]
+    return np.einsum("jk,tjk->tk", st.poisson.pmf(second, 2.0)[:, None] * np.ones(len(X)),
+                     st.poisson.pmf(first, np.exp(1 + X)))  # fmt: skip
 
 
 def contaminated(y, p):
@@ -112,12 +122,13 @@ def exact(name, y, p=0.1):
         "outliers": lambda: contaminated(y, p),
         "absent": lambda: inflated(y, p),
         "scattered": lambda: st.betabinom.pmf(y[:, None], 10, np.exp(X), 2.0),
+        "differences": lambda: subtracted(y),
         "lifetimes": lambda: weibull(y),
     }[name]()
     return grid_log_likelihood(FIRST, AR, g, STEP)
 
 
-MODELS = {m.name: m for m in (outliers, jumps, absent, scattered, lifetimes, headings)}
+MODELS = {m.name: m for m in (outliers, jumps, absent, scattered, differences, lifetimes, headings)}
 THETA = {"outliers": {"p": 0.1}, "jumps": {"p": 0.1, "m": 1.0}, "absent": {"p": 0.1}}
 
 
@@ -128,7 +139,8 @@ def data_of(name, steps=12):
 
 
 CASES = [(name, "bootstrap") for name in MODELS]
-CASES += [(name, "guided") for name in ("outliers", "absent", "scattered", "lifetimes")]
+OF_SLOPES = ("outliers", "absent", "scattered", "differences", "lifetimes")
+CASES += [(name, "guided") for name in OF_SLOPES]
 
 
 @pytest.mark.parametrize(("name", "proposal"), CASES)

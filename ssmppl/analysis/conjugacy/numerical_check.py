@@ -293,7 +293,8 @@ def _edged(
 
 
 def _integers(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    low = np.where(np.isfinite(low), np.ceil(low), 0.0)
+    endless = np.where(np.isfinite(high), np.floor(high) - 5.0, -2.0)
+    low = np.where(np.isfinite(low), np.ceil(low), endless)
     high = np.floor(np.minimum(high, low + 5.0))
     return low + np.floor(rng.random(POINTS) * (high - low + 1.0))
 

@@ -18,6 +18,7 @@ from ssmppl.language.distributions.discrete import (
     Dirac,
     NegativeBinomial,
     Poisson,
+    Skellam,
 )
 from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
@@ -51,7 +52,7 @@ DISTRIBUTIONS: dict[str, type[Distribution]] = {
         Normal, MvNormal, LogNormal, SkewNormal, StudentT, Laplace, Logistic, Cauchy, HalfNormal,
         HalfCauchy, Uniform, Exponential, Weibull, Pareto, Gamma, InverseGamma, Beta, VonMises,
         Dirichlet, Wishart, InverseWishart, LKJ, Ordered, LogisticNormal, MvStudentT, Poisson,
-        NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical, Multinomial,
+        NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Skellam, Categorical, Multinomial,
         EulerMultinomial, Dirac, Truncated, Censored, Mixture, ZeroInflated, Flat, HalfFlat,
     )
 }  # fmt: skip

@@ -1,5 +1,5 @@
-"""Counts: Poisson, NegativeBinomial, Binomial, BetaBinomial and Bernoulli, elementwise of arrays;
-Categorical; and Dirac, which is a point.
+"""Counts: Poisson, NegativeBinomial, Binomial, BetaBinomial and Bernoulli, and Skellam, the
+difference of two, elementwise of arrays; Categorical; and Dirac, which is a point.
 
 Johnson, Kemp and Kotz (2005), "Univariate discrete distributions". Values are whole numbers held
 as floating point, as all values of a model are.
@@ -203,6 +203,73 @@ class NegativeBinomial(_Counts):
         for k in range(power):
             factor = factor * (r + k) * (self.mean_ / r)
         return factor, NegativeBinomial(self.mean_ * (r + power) / r, dispersion=r + power)
+
+
+class Skellam(_Counts):
+    """Skellam(rate1, rate2): N1 - N2 of independent counts Poisson(rate1) and Poisson(rate2).
+
+    Goals of two teams, up and down ticks of a price, arrivals less departures; the value may be any
+    whole number. (Johnson, Kemp and Kotz 2005, section 4.12.3.)
+
+    Parameters
+    ----------
+    rate1, rate2 : not negative; the mean is rate1 - rate2, the variance rate1 + rate2.
+    """
+
+    highest = 0.0
+
+    def __init__(self, rate1: Any, rate2: Any):
+        self._set(rate1=rate1, rate2=rate2)
+        self._require("rate1", 0.0, strict=False)
+        self._require("rate2", 0.0, strict=False)
+
+    def support(self):
+        return Support("integers", self._full(-INFINITY), self._full(INFINITY))
+
+    def log_densities(self, value):
+        return array(ew("skellam_log_mass", value, self.rate1, self.rate2))
+
+    def sample(self, draws):
+        def draw(i):
+            return draws.poisson(self.rate1[i]) - draws.poisson(self.rate2[i])
+
+        return self._each(draw)
+
+    def mean(self):
+        return self.rate1 - self.rate2
+
+    def variance(self):
+        return self.rate1 + self.rate2
+
+    def cdf(self, value):
+        return array(ew("skellam_cdf", value, self.rate1, self.rate2))
+
+    def survival(self, value):  # of N2 - N1, which has the rates in turn
+        return array(ew("skellam_cdf", -self._floor(value) - 1.0, self.rate2, self.rate1))
+
+    def quantile(self, p):
+        return array(ew("skellam_quantile", self.rate1, self.rate2, p))
+
+    def survival_quantile(self, p):
+        return -array(ew("skellam_quantile", self.rate2, self.rate1, p))
+
+    def truncated_moments(self, lower, upper):
+        # sums of k P(k) = a P(k - 1) - b P(k + 1), by what they lack at the bounds of those of P(k)
+        a, b, log_mass = self.rate1, self.rate2, self.log_mass(lower, upper)
+
+        def share(k: Any) -> ExprArray:
+            return array(ew("exp", self.log_densities(array(k)) - log_mass))
+
+        before, first = share(lower - 1.0), share(lower)
+        last, after = share(upper), share(upper + 1.0)
+        down, up = before - last, after - first
+        by = a * down - b * up
+        twice_down = down + share(lower - 2.0) - share(upper - 1.0)
+        twice_up = up + share(upper + 2.0) - share(lower + 1.0)
+        variance = a * (1.0 + down) + b * (1.0 + up) + a**2 * twice_down + b**2 * twice_up
+        variance = variance - by * (2.0 * (a - b) + by)
+        several = where(ew("eq", lower, upper), 0.0, 1.0)
+        return a - b + by, several * ew("maximum", variance, 0.0)
 
 
 class _OutOf(_Counts):

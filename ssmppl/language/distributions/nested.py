@@ -65,8 +65,10 @@ def cut(law: Distribution, value: ExprArray) -> ExprArray:
     if within is None:
         return array(law.log_densities(value))
     middle: Any = 0.5 * (lower + upper)
-    if law.discrete or high_end:
-        middle = lower + (0.0 if law.discrete else 1.0)
+    if law.discrete:
+        middle = upper if low_end else lower
+    elif high_end:
+        middle = lower + 1.0
     elif low_end:
         middle = upper - 1.0
     inside = law.log_densities(where(within, value, middle))

@@ -119,8 +119,6 @@ HINTS: dict[str, str] = {
     **dict.fromkeys(["sech2", "logisticdistribution"], "ssm.Logistic(loc, scale=)"),
     "gumbel": "loc - scale * np.log(e), with e from ssm.Exponential(rate=1), where it acts; or "
     + _OWN,
-    "skellam": "the difference of two draws of the step: ssm.Poisson(a) and ssm.Poisson(b) under "
-    "names of their own, and ssm.Dirac of the difference",
     **dict.fromkeys(
         ["multivariatestudentt", "mvt", "multivariatet", "multistudentt", "multivariatestudent"],
         "ssm.MvStudentT(df, loc, scale=), scale a matrix",

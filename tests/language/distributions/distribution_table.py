@@ -94,26 +94,29 @@ def _pareto(shape, scale):
 
 
 class Counted:
-    """A law of counts by its masses at 0, 1, ..., both tails summed from their own ends."""
+    """A law of whole numbers by its masses at first, first + 1, ..., both tails summed from their
+    own ends."""
 
-    def __init__(self, log_masses):
+    def __init__(self, log_masses, first=0):
+        self.first = first
         self.log_masses = np.asarray(log_masses, dtype=float)
         masses = np.exp(self.log_masses)
         self._below = np.concatenate([[0.0], np.minimum(np.cumsum(masses), 1.0)])
         self._below[-1] = 1.0
         self._above = np.concatenate([np.cumsum(masses[::-1])[::-1], [0.0]])
-        k = np.arange(len(masses))
+        k = first + np.arange(len(masses))
         self._mean = float(k @ masses)
         self._var = float((k - self._mean) ** 2 @ masses)
 
     def support(self):
-        return 0.0, float(len(self.log_masses) - 1)
+        return float(self.first), float(self.first + len(self.log_masses) - 1)
 
     def _at(self, x):
-        return np.clip(np.floor(x), -1, len(self.log_masses) - 1).astype(int)
+        return np.clip(np.floor(x) - self.first, -1, len(self.log_masses) - 1).astype(int)
 
     def logpmf(self, x):
-        inside = (x >= 0) & (x < len(self.log_masses)) & (x == np.floor(x))
+        i = x - self.first
+        inside = (i >= 0) & (i < len(self.log_masses)) & (i == np.floor(i))
         return np.where(inside, self.log_masses[np.maximum(self._at(x), 0)], -np.inf)
 
     def pmf(self, x):
@@ -126,17 +129,41 @@ class Counted:
         return self._above[self._at(x) + 1]
 
     def ppf(self, p):
-        return np.minimum(np.searchsorted(self._below[1:], p), len(self.log_masses) - 1) * 1.0
+        below = np.searchsorted(self._below[1:], p)
+        return self.first + np.minimum(below, len(self.log_masses) - 1) * 1.0
 
     def isf(self, p):
         below = np.searchsorted(-self._above[1:], -np.asarray(p))
-        return np.minimum(below, len(self.log_masses) - 1) * 1.0
+        return self.first + np.minimum(below, len(self.log_masses) - 1) * 1.0
+
+    def logcdf(self, x):
+        return np.log(self.cdf(x))
+
+    def logsf(self, x):
+        return np.log(self.sf(x))
 
     def mean(self):
         return self._mean
 
     def var(self):
         return self._var
+
+    def std(self):
+        return math.sqrt(self._var)
+
+
+class Difference(Counted):
+    """Of two Poisson counts: the sum over the second, from far in one tail to far in the other."""
+
+    def __init__(self, rate1, rate2):
+        away = int(45.0 * math.sqrt(rate1 + rate2)) + 450
+        k = int(rate1 - rate2) + np.arange(-away, away + 1)[:, None]
+        second = np.arange(int(rate1 + rate2) + 2 * away)
+        logs = st.poisson.logpmf(second + k, rate1) + st.poisson.logpmf(second, rate2)
+        super().__init__(special.logsumexp(logs, axis=1), int(k[0, 0]))
+
+    def support(self):
+        return -math.inf, math.inf
 
 
 def _beta_binomial(n, a, b):
@@ -306,6 +333,9 @@ CASES = [
     Case(D.Bernoulli, {"p": 0.5}, st.bernoulli(0.5)),
     Case(D.Bernoulli, {"p": 1e-4}, st.bernoulli(1e-4)),
     Case(D.Bernoulli, {"p": 0.97}, st.bernoulli(0.97)),
+    Case(D.Skellam, {"rate1": 3.0, "rate2": 1.5}, Difference(3.0, 1.5)),
+    Case(D.Skellam, {"rate1": 0.02, "rate2": 0.4}, Difference(0.02, 0.4)),
+    Case(D.Skellam, {"rate1": 90.0, "rate2": 250.0}, Difference(90.0, 250.0)),
     Case(D.Categorical, {"p": [0.2, 0.5, 0.3]}, _categorical([0.2, 0.5, 0.3])),
     Case(D.Categorical, {"p": [0.999, 0.001]}, _categorical([0.999, 0.001])),
     Case(D.Categorical, {"p": [0.25] * 4}, _categorical([0.25] * 4)),
@@ -445,6 +475,10 @@ TRUNCATED_CASES = [
     *_truncated(D.Poisson, {"rate": 4.0}, st.poisson(4.0), (1.0, _INF), (30.0, _INF),
                 (-_INF, 2.0), (3.0, 6.0), (25.0, 27.0), (30.0, 32.0)),
     *_truncated(D.Poisson, {"rate": 60.0}, st.poisson(60.0), (-_INF, 10.0)),
+    *_truncated(D.Skellam, {"rate1": 3.0, "rate2": 1.5}, Difference(3.0, 1.5), (0.0, _INF),
+                (20.0, _INF), (-_INF, 4.0), (-_INF, -12.0), (-2.0, 3.0), (-15.0, -14.0)),
+    *_truncated(D.Skellam, {"rate1": 90.0, "rate2": 250.0}, Difference(90.0, 250.0),
+                (-_INF, -170.0), (-120.0, _INF)),
     *_truncated(D.Binomial, {"n": 20.0, "p": 0.3}, st.binom(20, 0.3), (1.0, _INF), (18.0, _INF),
                 (-_INF, 3.0), (5.0, 9.0)),
     *_truncated(D.NegativeBinomial, {"mean": 5.0, "dispersion": 2.0}, _negative_binomial(5.0, 2.0),

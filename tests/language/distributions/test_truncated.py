@@ -40,7 +40,8 @@ def grid(case):
     a, b = max(case.lower, low), min(case.upper, high)
     if case.base.cls.discrete:
         top = b if math.isfinite(b) else max(law.mean() + 40 * law.std(), a) + 400
-        x = np.arange(max(math.ceil(a), 0), top + 1)
+        bottom = a if math.isfinite(a) else min(law.mean() - 40 * law.std(), b) - 400
+        x = np.arange(math.ceil(bottom), top + 1)
         return x, np.ones(len(x)), np.exp(law.logpmf(x) - mass)
     inside = [v for v in (law.median(), law.mean()) if a < v < b]
     ends = [v for v in (a, b, *inside) if math.isfinite(v)]
