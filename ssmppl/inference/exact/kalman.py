@@ -49,6 +49,7 @@ from ssmppl.inference.exact.kalman_matrices import (
     SmoothedMoments,
     Stopped,
     drawn,
+    drawn_by_correction,
     smoothed,
 )
 from ssmppl.inference.run.invalid_laws import total_of
@@ -362,6 +363,10 @@ class KalmanModel(Scored):
         model = self.matrices(experiment, theta)
         try:
             start = start_of(self.trace, self.form.flat, model, experiment)
+            if draws == 1:
+                out = drawn_by_correction(model, start.columns, experiment, stream)
+                if out is not None:
+                    return out
             log_given, out = drawn(model, start.columns, experiment, stream, draws)
         except Stopped as stop:
             raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None

@@ -19,6 +19,8 @@ from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
 from ssmppl.language.model.trace import Trace, previous
 
+MOST_KEPT = 4_000_000  # numbers of all roots, which the quick kernel for one draw keeps
+
 CAUSE = {
     kernel.NOT_COVARIANCE: (
         "a covariance is not positive semidefinite",
@@ -119,6 +121,20 @@ def smoothed(
     if status != OK:
         raise Stopped(status, t)
     return SmoothedMoments(*moments, total_of(increments)), disturbances
+
+
+def drawn_by_correction(
+    model: Matrices, start: np.ndarray, experiment: Experiment, stream: np.ndarray
+) -> np.ndarray | None:
+    """One draw (1, T, D) from p(x_{1:T} | y_{1:T}); None where the quick kernel has none: `drawn`
+    then has it, or says why there is none."""
+    if experiment.steps * len(model.m) ** 2 > MOST_KEPT:
+        return None
+    out = np.empty((1, experiment.steps, len(model.m)))
+    status, _ = exact_entry("draw_by_correction")(
+        model, start, experiment.y, experiment.seen, stream, out[0]
+    )
+    return out if status == OK else None
 
 
 def drawn(

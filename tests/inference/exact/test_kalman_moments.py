@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+import ssmppl as ssm
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.errors import SamplingError
 from ssmppl.inference.exact.kalman import kalman_model
+from ssmppl.inference.exact.kalman_matrices import drawn_by_correction
+from ssmppl.inference.run.problem import pose
 from tests.models.kalman import MODELS, posed, scalar
 from tests.statistics.checks import seed_of
 
@@ -39,17 +42,66 @@ def test_smoother_is_the_dense_gaussian(build, missing):
     np.testing.assert_allclose(noises.state_mean[1:], step, atol=1e-9)
 
 
+@pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("build", MODELS)
-def test_draws_are_of_the_dense_gaussian(build):
+def test_draws_are_of_the_dense_gaussian(build, together):
+    """Many draws at once go back by square roots, a single one by the mean of another record."""
     traced, theta, experiment, dense = posed(build, 0.3)
-    stream = new_state(np.random.SeedSequence(seed_of("kalman draws", build.__name__)))
-    draws = kalman_model(traced).draw(experiment, theta, stream, 4_000)
+    stream = new_state(np.random.SeedSequence(seed_of("kalman draws", build.__name__, together)))
+    model = kalman_model(traced)
+    if together:
+        draws = model.draw(experiment, theta, stream, 4_000)
+    else:
+        matrices = model.matrices(experiment, theta)
+        start = matrices.m[:, None].copy()
+        one = [drawn_by_correction(matrices, start, experiment, stream) for _ in range(4_000)]
+        draws = np.concatenate(one)  # none of them is None
     mean, covariance = joint(dense, experiment)
     size = mean.size
     x, c = draws.reshape(len(draws), size) - mean.ravel(), covariance.reshape(size, size)
     spread = np.sqrt((np.outer(np.diag(c), np.diag(c)) + c**2) / len(draws))
     assert (np.abs(x.mean(0)) <= 5 * np.sqrt(np.diag(c).clip(0) / len(draws)) + 1e-9).all()
     assert (np.abs(x.T @ x / len(draws) - c) <= 5 * spread + 1e-9).all()
+
+
+def trend(vague, growth=1.0, rows=120):
+    """A level with a slope, measured in most rows, posed with its Kalman model."""
+    made = ssm.Model("trend")
+    made.initial(lambda: {"x": ssm.Normal(0, sd=vague), "v": ssm.Normal(0, sd=1)})
+    made.transition(lambda x, v: {"x": ssm.Normal(growth * x + v, sd=0.1), "v": ssm.Dirac(v)})
+    made.observation(lambda x: {"y": ssm.Normal(x, sd=0.5)})
+    rng = np.random.default_rng(seed_of("trend", rows))
+    y = 3.0 + 0.2 * np.arange(rows) + rng.normal(size=rows)
+    y[::7] = np.nan
+    problem = pose(made, {"y": y})
+    return kalman_model(problem.trace), problem.experiments[0]
+
+
+@pytest.mark.parametrize(
+    ("vague", "growth", "sure"),
+    [(1.0, 1.0, True), (100.0, 0.9, True), (1e9, 1.0, False), (1.0, 1.4, False)],
+)
+def test_what_rounding_has_eaten_is_drawn_in_the_other_way(vague, growth, sure):
+    """A start that is next to unknown, and a model that grows until only its end is known."""
+    model, e = trend(vague, growth)
+    matrices = model.matrices(e, np.empty(0))
+    start = matrices.m[:, None].copy()
+    stream = new_state(np.random.SeedSequence(seed_of("rounding", vague, growth)))
+    quick = [drawn_by_correction(matrices, start, e, stream) for _ in range(300)]
+    assert all((d is not None) is sure for d in quick)
+    exact = model.smooth(e, np.empty(0))
+    draws = np.concatenate([model.draw(e, np.empty(0), stream) for _ in range(300)])
+    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    assert np.all(np.abs(draws.mean(0) - exact.mean) < 5.5 * sd / np.sqrt(300) + 1e-9)
+    assert np.all(draws.std(0) < 1.35 * sd + 1e-9)
+    assert np.all(draws.std(0) > 0.7 * sd - 1e-9)
+
+
+def test_a_single_draw_keeps_what_is_deterministic():
+    """To the last digit: a slope without noise, and a state that is another one's past."""
+    model, e = trend(1.0)
+    draw = model.draw(e, np.empty(0), new_state(np.random.SeedSequence(1)))[0]
+    np.testing.assert_allclose(draw[:, 1], draw[0, 1], rtol=1e-13)
 
 
 def test_what_does_not_exist_is_named():
