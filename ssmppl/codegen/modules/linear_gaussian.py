@@ -51,6 +51,11 @@ class MatrixProgram:
     entries: np.ndarray
     _placed: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
 
+    @property
+    def by_row(self) -> bool:
+        """Whether some entry depends on a row: on inputs, time or y_{t-1}."""
+        return bool(np.any(self.entries[:, 0] == BY_ROW))
+
     def matrices(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
     ) -> Matrices:

@@ -18,7 +18,7 @@ about their entries (`codegen/kernels/kalman/adjoint.py`). No parameter costs an
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,6 +50,7 @@ from ssmppl.inference.exact.kalman_matrices import (
     Stopped,
     drawn,
     drawn_by_correction,
+    log_likelihoods,
     smoothed,
 )
 from ssmppl.inference.run.invalid_laws import total_of
@@ -284,7 +285,10 @@ class KalmanModel(Scored):
             np.empty((0, d)), np.empty((0, d, d)), np.empty((0, d)), np.empty((0, d, d)),
             np.empty((0, k)), np.empty((0, k, k)),
         )  # fmt: skip
-        total, (_, program) = 0.0, _ordered(self.trace)
+        experiments, total, (_, program) = list(experiments), 0.0, _ordered(self.trace)
+        if self._shared(experiments):
+            e = experiments[0]
+            return log_likelihoods(program.matrices(theta, e.y, e.seen, e.u), experiments)
         for e in experiments:
             model, increments = program.matrices(theta, e.y, e.seen, e.u), np.empty(e.steps)
             if self.form.flat:
@@ -296,6 +300,26 @@ class KalmanModel(Scored):
             exact_entry("kalman_filter")(*model, e.y, e.seen, increments, *nothing)
             total += total_of(increments)
         return total
+
+    def _shared(self, experiments: Sequence[Experiment]) -> bool:
+        """Whether these are several that have the same matrices and a start that is known."""
+        if len(experiments) < 2 or self.form.flat:
+            return False
+        return not _ordered(self.trace)[1].by_row
+
+    def draw_each(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, streams: Sequence[np.ndarray],
+        draws: int = 1,
+    ) -> list[np.ndarray]:  # fmt: skip
+        """As `draw`, of each experiment with its own stream, or one and the same."""
+        one = draws == 1 and all(stream is streams[0] for stream in streams)
+        if one and self._shared(experiments):
+            model = self.matrices(experiments[0], theta)
+            start = model.m[:, None].copy()
+            quick = drawn_by_correction(model, start, experiments, streams[0])
+            if quick is not None:
+                return quick
+        return super().draw_each(experiments, theta, streams, draws)
 
     def filter(self, experiment: Experiment, theta: np.ndarray) -> KalmanMoments:
         """The filter's moments and predictions.
@@ -364,9 +388,9 @@ class KalmanModel(Scored):
         try:
             start = start_of(self.trace, self.form.flat, model, experiment)
             if draws == 1:
-                out = drawn_by_correction(model, start.columns, experiment, stream)
-                if out is not None:
-                    return out
+                quick = drawn_by_correction(model, start.columns, [experiment], stream)
+                if quick is not None:
+                    return quick[0]
             log_given, out = drawn(model, start.columns, experiment, stream, draws)
         except Stopped as stop:
             raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None

@@ -5,7 +5,9 @@ distributions have no density.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -124,17 +126,37 @@ def smoothed(
 
 
 def drawn_by_correction(
-    model: Matrices, start: np.ndarray, experiment: Experiment, stream: np.ndarray
-) -> np.ndarray | None:
-    """One draw (1, T, D) from p(x_{1:T} | y_{1:T}); None where the quick kernel has none: `drawn`
-    then has it, or says why there is none."""
-    if experiment.steps * len(model.m) ** 2 > MOST_KEPT:
+    model: Matrices, start: np.ndarray, experiments: Sequence[Experiment], stream: np.ndarray
+) -> list[np.ndarray] | None:
+    """One draw (1, T, D) from p(x_{1:T} | y_{1:T}) of each experiment, which share the model; None
+    where the quick kernel has none: `drawn` then has it, or says why there is none."""
+    if max(e.steps for e in experiments) * len(model.m) ** 2 > MOST_KEPT:
         return None
-    out = np.empty((1, experiment.steps, len(model.m)))
-    status, _ = exact_entry("draw_by_correction")(
-        model, start, experiment.y, experiment.seen, stream, out[0]
-    )
-    return out if status == OK else None
+    y, seen, first = end_to_end(experiments)
+    out = np.empty((1, len(y), len(model.m)))
+    status, _ = exact_entry("draws_by_correction")(model, start, y, seen, first, stream, out[0])
+    if status != OK:
+        return None
+    return [out[:, a:b] for a, b in pairwise(first.tolist())]
+
+
+def log_likelihoods(model: Matrices, experiments: Sequence[Experiment]) -> float:
+    """log p(y), summed over experiments that share the model, whose start is known."""
+    y, seen, first = end_to_end(experiments)
+    increments = np.empty(len(y))
+    exact_entry("log_likelihoods")(model, model.m[:, None].copy(), y, seen, first, increments)
+    return total_of(increments)
+
+
+def end_to_end(experiments: Sequence[Experiment]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """y and seen of all experiments, and where each begins, as kernels over several take them."""
+    first = np.cumsum([0, *(e.steps for e in experiments)])
+    if len(experiments) == 1:
+        return experiments[0].y, experiments[0].seen, first
+    return (
+        np.concatenate([e.y for e in experiments]), np.concatenate([e.seen for e in experiments]),
+        first,
+    )  # fmt: skip
 
 
 def drawn(

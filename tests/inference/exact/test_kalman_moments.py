@@ -54,8 +54,8 @@ def test_draws_are_of_the_dense_gaussian(build, together):
     else:
         matrices = model.matrices(experiment, theta)
         start = matrices.m[:, None].copy()
-        one = [drawn_by_correction(matrices, start, experiment, stream) for _ in range(4_000)]
-        draws = np.concatenate(one)  # none of them is None
+        one = [drawn_by_correction(matrices, start, [experiment], stream) for _ in range(4_000)]
+        draws = np.concatenate([d[0] for d in one])  # none of them is None
     mean, covariance = joint(dense, experiment)
     size = mean.size
     x, c = draws.reshape(len(draws), size) - mean.ravel(), covariance.reshape(size, size)
@@ -87,7 +87,7 @@ def test_what_rounding_has_eaten_is_drawn_in_the_other_way(vague, growth, sure):
     matrices = model.matrices(e, np.empty(0))
     start = matrices.m[:, None].copy()
     stream = new_state(np.random.SeedSequence(seed_of("rounding", vague, growth)))
-    quick = [drawn_by_correction(matrices, start, e, stream) for _ in range(300)]
+    quick = [drawn_by_correction(matrices, start, [e], stream) for _ in range(300)]
     assert all((d is not None) is sure for d in quick)
     exact = model.smooth(e, np.empty(0))
     draws = np.concatenate([model.draw(e, np.empty(0), stream) for _ in range(300)])
@@ -102,6 +102,54 @@ def test_a_single_draw_keeps_what_is_deterministic():
     model, e = trend(1.0)
     draw = model.draw(e, np.empty(0), new_state(np.random.SeedSequence(1)))[0]
     np.testing.assert_allclose(draw[:, 1], draw[0, 1], rtol=1e-13)
+
+
+def several():
+    """Five records of one model: of other lengths, two of them with a row of their own missing."""
+    made = ssm.Model("panel")
+    made.prior(lambda: {"phi": ssm.Uniform(-1, 1), "q": ssm.HalfNormal(sd=1)})
+    made.initial(lambda: {"x": ssm.Normal(1, sd=2), "v": ssm.Normal(0, sd=0.5)})
+    made.transition(
+        lambda x, v, phi, q: {"x": ssm.Normal(phi * x + v, sd=q), "v": ssm.Normal(0.9 * v, sd=0.2)}
+    )
+    made.observation(
+        lambda x, v: {"y": ssm.Normal(x + 0.3, sd=0.5), "z": ssm.Normal(x - v, sd=0.8)}
+    )
+    rng = np.random.default_rng(seed_of("several"))
+    data = [{"y": rng.normal(size=n), "z": rng.normal(size=n)} for n in (5, 9, 7, 9, 3)]
+    data[2]["y"][3], data[3]["z"][8], data[3]["y"][0] = np.nan, np.nan, np.nan
+    return pose(made, data)
+
+
+def test_records_that_share_their_matrices_are_filtered_in_one_call():
+    problem, theta = several(), np.array([0.7, 0.4])
+    model = kalman_model(problem.trace)
+    each = [model.log_likelihood([e], theta) for e in problem.experiments]
+    together = model.log_likelihood(problem.experiments, theta)
+    assert together == pytest.approx(sum(each), abs=1e-10)
+    reverse = model.log_likelihood(problem.experiments[::-1], theta)
+    assert reverse == pytest.approx(sum(each), abs=1e-10)
+    assert model.log_likelihood(problem.experiments, np.array([0.7, np.nan])) == -np.inf
+
+
+def test_records_that_share_their_matrices_are_drawn_in_one_call(monkeypatch):
+    problem, theta, count = several(), np.array([0.7, 0.4]), 3_000
+    model = kalman_model(problem.trace)
+    monkeypatch.setattr(type(model), "draw", None)  # not one by one
+    stream = new_state(np.random.SeedSequence(seed_of("several draws")))
+    streams = [stream] * len(problem.experiments)
+    drawn = [model.draw_each(problem.experiments, theta, streams) for _ in range(count)]
+    for i, e in enumerate(problem.experiments):
+        found = model.smooth(e, theta)
+        x = np.concatenate([d[i] for d in drawn])
+        assert x.shape == (count, e.steps, 2)
+        sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        assert np.all(np.abs(x.mean(0) - found.mean) < 5 * sd / np.sqrt(count))
+        assert np.all(np.abs(x.var(0) / sd**2 - 1) < 5 * np.sqrt(2 / count))
+    first = np.concatenate([d[0][0, 0] for d in drawn]).reshape(count, 2)
+    second = np.concatenate([d[1][0, 0] for d in drawn]).reshape(count, 2)
+    together = np.corrcoef(first.T, second.T)[:2, 2:]  # of records that have nothing to do
+    assert np.all(np.abs(together) < 5 / np.sqrt(count))
 
 
 def test_what_does_not_exist_is_named():
