@@ -14,7 +14,7 @@ from typing import Any
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.codegen.kernels.hmm import passes
 from ssmppl.codegen.kernels.hmm.tables import expected_slopes, write_tables
-from ssmppl.codegen.kernels.kalman import adjoint, correction, diffuse, smoother, square_root
+from ssmppl.codegen.kernels.kalman import adjoint, diffuse, several, smoother, square_root
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.store import folder
 from ssmppl.codegen.text.kernel_functions import weight_targets
@@ -31,8 +31,8 @@ ENTRIES: dict[str, Callable[..., Any]] = {
     "kalman_filter": square_root.kalman_filter,
     "smooth": smoother.smooth,
     "draw": smoother.draw,
-    "draws_by_correction": correction.draws_by_correction,
-    "log_likelihoods": correction.log_likelihoods,
+    "draws_by_correction": several.draws_by_correction,
+    "log_likelihoods": several.log_likelihoods,
     "adjoints": adjoint.adjoints,
     "diffuse_filter": diffuse.diffuse_filter,
     "finite_forward": passes.forward,

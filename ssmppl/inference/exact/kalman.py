@@ -45,6 +45,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact import kalman_matrices
 from ssmppl.inference.exact.derivatives import Scored
 from ssmppl.inference.exact.kalman_matrices import (
+    MOST_KEPT,
     Disturbances,
     SmoothedMoments,
     Stopped,
@@ -302,10 +303,12 @@ class KalmanModel(Scored):
         return total
 
     def _shared(self, experiments: Sequence[Experiment]) -> bool:
-        """Whether these are several that have the same matrices and a start that is known."""
-        if len(experiments) < 2 or self.form.flat:
+        """Whether these are several that have the same matrices and a start that is known, and are
+        short enough to keep what the longest one shares."""
+        if len(experiments) < 2 or self.form.flat or _ordered(self.trace)[1].by_row:
             return False
-        return not _ordered(self.trace)[1].by_row
+        k, d = len(self.trace.observation_symbols), len(self.trace.state_symbols)
+        return max(e.steps for e in experiments) * k * (k + d) <= MOST_KEPT
 
     def draw_each(
         self, experiments: Sequence[Experiment], theta: np.ndarray, streams: Sequence[np.ndarray],

@@ -120,6 +120,41 @@ def filter_forward(model, start, y, seen, x, kept, z, roots, log_increment):
 
 
 @exact
+def means_forward(model, start, y, seen, x, kept, z, log_increment):
+    """`filter_forward` of a record whose arrays are known, from another one that misses the same:
+    what is not known of the states does not depend on what was measured."""
+    n_steps, n, k_all, columns = y.shape[0], start.shape[0], y.shape[1], start.shape[1]
+    where_a, where_c = np.empty((n * n, 2), np.int64), np.empty((k_all * n, 2), np.int64)
+    count_a, count_c, place = 0, 0, np.empty(k_all, np.int64)
+    before = np.empty((n, columns))
+    log_increment[:] = -np.inf
+    copy(start, before)
+    for t in range(n_steps):
+        c, d = model.C[at(t, model.C.shape[0])], model.d[at(t, model.d.shape[0])]
+        if t == 0 or model.C.shape[0] > 1:
+            count_c = nonzeros(c, where_c)
+        k = 0
+        for p in range(k_all):
+            place[p] = -1
+            if seen[t, p] != 0.0:
+                place[p] = k
+                k += 1
+        if t > 0:
+            a, b = model.A[at(t, model.A.shape[0])], model.b[at(t, model.b.shape[0])]
+            if t == 1 or model.A.shape[0] > 1:
+                count_a = nonzeros(a, where_a)
+            add_known(a, where_a, count_a, x[t - 1], b, before)
+        innovate(c, where_c, count_c, d, y[t], place, k, before, kept[t], z[t], x[t])
+        increment = log_density(kept[t], z[t], k)
+        if increment == np.inf:
+            return SINGULAR, t
+        if not abs(increment) < np.inf:
+            return NOT_FINITE, t
+        log_increment[t] = increment
+    return OK, n_steps
+
+
+@exact
 def adjoints(model, start, y, seen, wanted, log_increment, adjoint):
     """Derivatives of log p(y); returns (status, t) of the forward pass.
 

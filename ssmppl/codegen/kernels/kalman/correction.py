@@ -17,18 +17,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.codegen.kernels.kalman.adjoint import filter_forward
-from ssmppl.codegen.kernels.kalman.square_root import (
-    NOT_COVARIANCE,
-    NOT_FINITE,
-    OK,
-    SINGULAR,
-    at,
-    nonzeros,
-    same,
-    square_root,
-)
-from ssmppl.codegen.kernels.kalman.steps import add_known, copy, innovate, log_density, root_at
+from ssmppl.codegen.kernels.kalman.adjoint import filter_forward, means_forward
+from ssmppl.codegen.kernels.kalman.square_root import NOT_COVARIANCE, OK, at, square_root
+from ssmppl.codegen.kernels.kalman.steps import root_at
 from ssmppl.codegen.kernels.math.flags import exact
 from ssmppl.codegen.kernels.math.random import fill_normal
 
@@ -113,50 +104,6 @@ def slopes_back(model, seen, kept, z, r):
 
 
 @exact
-def misses_alike(seen, other):
-    """Whether a record (T, K) misses what another one of at least as many rows does."""
-    for t in range(seen.shape[0]):
-        if not same(seen[t], other[t]):
-            return False
-    return True
-
-
-@exact
-def means_forward(model, start, y, seen, x, kept, z, log_increment):
-    """`filter_forward` of a record whose arrays are known, from another one that misses the same:
-    what is not known of the states does not depend on what was measured."""
-    n_steps, n, k_all, columns = y.shape[0], start.shape[0], y.shape[1], start.shape[1]
-    where_a, where_c = np.empty((n * n, 2), np.int64), np.empty((k_all * n, 2), np.int64)
-    count_a, count_c, place = 0, 0, np.empty(k_all, np.int64)
-    before = np.empty((n, columns))
-    log_increment[:] = -np.inf
-    copy(start, before)
-    for t in range(n_steps):
-        c, d = model.C[at(t, model.C.shape[0])], model.d[at(t, model.d.shape[0])]
-        if t == 0 or model.C.shape[0] > 1:
-            count_c = nonzeros(c, where_c)
-        k = 0
-        for p in range(k_all):
-            place[p] = -1
-            if seen[t, p] != 0.0:
-                place[p] = k
-                k += 1
-        if t > 0:
-            a, b = model.A[at(t, model.A.shape[0])], model.b[at(t, model.b.shape[0])]
-            if t == 1 or model.A.shape[0] > 1:
-                count_a = nonzeros(a, where_a)
-            add_known(a, where_a, count_a, x[t - 1], b, before)
-        innovate(c, where_c, count_c, d, y[t], place, k, before, kept[t], z[t], x[t])
-        increment = log_density(kept[t], z[t], k)
-        if increment == np.inf:
-            return SINGULAR, t
-        if not abs(increment) < np.inf:
-            return NOT_FINITE, t
-        log_increment[t] = increment
-    return OK, n_steps
-
-
-@exact
 def draw_by_correction(model, start, y, seen, stream, known, kept, roots, out):
     """One draw from p(x_{1:T} | y_{1:T}); returns (status, t) of the forward pass, or UNSURE.
 
@@ -222,71 +169,3 @@ def draw_by_correction(model, start, y, seen, stream, known, kept, roots, out):
         if not off <= CLOSE * spread[i] + n_steps * ROUNDED * abs(here[i]):
             return UNSURE, n_steps
     return OK, n_steps
-
-
-@exact
-def longest_of(first):
-    """The data set of the most rows, and how many these are."""
-    chosen, most = 0, 0
-    for e in range(first.size - 1):
-        if first[e + 1] - first[e] > most:
-            chosen, most = e, first[e + 1] - first[e]
-    return chosen, most
-
-
-@exact
-def draws_by_correction(model, start, y, seen, first, stream, out):
-    """One draw of each data set, end to end as in `inference.run.problem.EndToEnd`, of one model;
-    returns (status, e), of the first whose status is other than OK. out (R, D), written.
-
-    Those that miss what the longest does share its arrays.
-    """
-    n, k_all, (chosen, most) = start.shape[0], y.shape[1], longest_of(first)
-    kept, roots = np.empty((most, k_all, k_all + n)), np.empty((most, n, n))
-    own, own_roots = np.empty((most, k_all, k_all + n)), np.empty((most, n, n))
-    pattern = seen[first[chosen] : first[chosen + 1]]
-    for step in range(-1, first.size - 1):
-        e = chosen if step < 0 else step
-        if step == chosen:
-            continue
-        a, b = first[e], first[e + 1]
-        if step < 0 or misses_alike(seen[a:b], pattern):
-            status, _ = draw_by_correction(
-                model, start, y[a:b], seen[a:b], stream, step >= 0, kept, roots, out[a:b]
-            )  # fmt: skip
-        else:
-            status, _ = draw_by_correction(
-                model, start, y[a:b], seen[a:b], stream, False, own, own_roots, out[a:b]
-            )  # fmt: skip
-        if status != OK:
-            return status, e
-    return OK, first.size - 1
-
-
-@exact
-def log_likelihoods(model, start, y, seen, first, log_increment):
-    """The filter over each data set, likewise; log_increment (R,), written, -inf from where one
-    stops."""
-    (n, columns), k_all, (chosen, most) = start.shape, y.shape[1], longest_of(first)
-    x, z, nothing = (
-        np.empty((most, n, columns)), np.empty((most, k_all, columns)), np.empty((0, n, n))
-    )  # fmt: skip
-    kept, own = np.empty((most, k_all, k_all + n)), np.empty((most, k_all, k_all + n))
-    pattern = seen[first[chosen] : first[chosen + 1]]
-    sound = False
-    for step in range(-1, first.size - 1):
-        e = chosen if step < 0 else step
-        if step == chosen:
-            continue
-        a, b = first[e], first[e + 1]
-        if step < 0:
-            status, _ = filter_forward(
-                model, start, y[a:b], seen[a:b], x, kept, z, nothing, log_increment[a:b]
-            )  # fmt: skip
-            sound = status == OK
-        elif sound and misses_alike(seen[a:b], pattern):
-            means_forward(model, start, y[a:b], seen[a:b], x, kept, z, log_increment[a:b])
-        else:
-            filter_forward(
-                model, start, y[a:b], seen[a:b], x, own, z, nothing, log_increment[a:b]
-            )  # fmt: skip
