@@ -104,25 +104,37 @@ def test_a_single_draw_keeps_what_is_deterministic():
     np.testing.assert_allclose(draw[:, 1], draw[0, 1], rtol=1e-13)
 
 
-def several():
-    """Five records of one model: of other lengths, two of them with a row of their own missing."""
-    made = ssm.Model("panel")
+def several(moved=False):
+    """Five records of one model: of other lengths, two of them with a row of their own missing;
+    moved by an input of their own, or alike."""
+    made = ssm.Model("panel", inputs=("u",) if moved else ())
     made.prior(lambda: {"phi": ssm.Uniform(-1, 1), "q": ssm.HalfNormal(sd=1)})
     made.initial(lambda: {"x": ssm.Normal(1, sd=2), "v": ssm.Normal(0, sd=0.5)})
-    made.transition(
-        lambda x, v, phi, q: {"x": ssm.Normal(phi * x + v, sd=q), "v": ssm.Normal(0.9 * v, sd=0.2)}
-    )
+    if moved:
+        made.transition(lambda x, v, u, phi, q: {
+            "x": ssm.Normal(phi * u * x + v, sd=q), "v": ssm.Normal(0.9 * v, sd=0.2)
+        })  # fmt: skip
+    else:
+        made.transition(
+            lambda x, v, phi, q: {
+                "x": ssm.Normal(phi * x + v, sd=q),
+                "v": ssm.Normal(0.9 * v, sd=0.2),
+            }
+        )
     made.observation(
         lambda x, v: {"y": ssm.Normal(x + 0.3, sd=0.5), "z": ssm.Normal(x - v, sd=0.8)}
     )
     rng = np.random.default_rng(seed_of("several"))
     data = [{"y": rng.normal(size=n), "z": rng.normal(size=n)} for n in (5, 9, 7, 9, 3)]
     data[2]["y"][3], data[3]["z"][8], data[3]["y"][0] = np.nan, np.nan, np.nan
+    for d in data if moved else []:
+        d["u"] = rng.uniform(0.2, 1.4, size=len(d["y"]))
     return pose(made, data)
 
 
-def test_records_that_share_their_matrices_are_filtered_in_one_call():
-    problem, theta = several(), np.array([0.7, 0.4])
+@pytest.mark.parametrize("moved", [False, True])
+def test_records_that_share_their_matrices_are_filtered_in_one_call(moved):
+    problem, theta = several(moved), np.array([0.7, 0.4])
     model = kalman_model(problem.trace)
     each = [model.log_likelihood([e], theta) for e in problem.experiments]
     together = model.log_likelihood(problem.experiments, theta)
