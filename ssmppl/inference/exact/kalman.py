@@ -59,6 +59,7 @@ from ssmppl.language.model.trace import Trace, once_per_trace
 
 __all__ = ["Disturbances", "Matrices", "SmoothedMoments"]
 
+LEAST_STATES = 4  # from which a single draw is made in the quick way: below, it gains nothing
 AGREEMENT = 1e-6  # of log p(y) by two roads; what is worse was lost to rounding
 LAWS = {"m": "initial", "P": "initial", "A": "transition", "b": "transition", "Q": "transition",
         "C": "observation", "d": "observation", "R": "observation"}  # fmt: skip
@@ -390,7 +391,7 @@ class KalmanModel(Scored):
         model = self.matrices(experiment, theta)
         try:
             start = start_of(self.trace, self.form.flat, model, experiment)
-            if draws == 1:
+            if draws == 1 and len(model.m) >= LEAST_STATES:
                 quick = drawn_by_correction(model, start.columns, [experiment], stream)
                 if quick is not None:
                     return quick[0]

@@ -6,6 +6,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.errors import SamplingError
+from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.exact.kalman_matrices import drawn_by_correction
 from ssmppl.inference.run.problem import pose
@@ -81,7 +82,7 @@ def trend(vague, growth=1.0, rows=120):
     ("vague", "growth", "sure"),
     [(1.0, 1.0, True), (100.0, 0.9, True), (1e9, 1.0, False), (1.0, 1.4, False)],
 )
-def test_what_rounding_has_eaten_is_drawn_in_the_other_way(vague, growth, sure):
+def test_what_rounding_has_eaten_is_drawn_in_the_other_way(monkeypatch, vague, growth, sure):
     """A start that is next to unknown, and a model that grows until only its end is known."""
     model, e = trend(vague, growth)
     matrices = model.matrices(e, np.empty(0))
@@ -90,6 +91,7 @@ def test_what_rounding_has_eaten_is_drawn_in_the_other_way(vague, growth, sure):
     quick = [drawn_by_correction(matrices, start, [e], stream) for _ in range(300)]
     assert all((d is not None) is sure for d in quick)
     exact = model.smooth(e, np.empty(0))
+    monkeypatch.setattr(kalman, "LEAST_STATES", 1)
     draws = np.concatenate([model.draw(e, np.empty(0), stream) for _ in range(300)])
     sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
     assert np.all(np.abs(draws.mean(0) - exact.mean) < 5.5 * sd / np.sqrt(300) + 1e-9)
@@ -97,8 +99,9 @@ def test_what_rounding_has_eaten_is_drawn_in_the_other_way(vague, growth, sure):
     assert np.all(draws.std(0) > 0.7 * sd - 1e-9)
 
 
-def test_a_single_draw_keeps_what_is_deterministic():
+def test_a_single_draw_keeps_what_is_deterministic(monkeypatch):
     """To the last digit: a slope without noise, and a state that is another one's past."""
+    monkeypatch.setattr(kalman, "LEAST_STATES", 1)
     model, e = trend(1.0)
     draw = model.draw(e, np.empty(0), new_state(np.random.SeedSequence(1)))[0]
     np.testing.assert_allclose(draw[:, 1], draw[0, 1], rtol=1e-13)
