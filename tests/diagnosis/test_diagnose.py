@@ -269,7 +269,7 @@ def test_a_fit_that_mostly_leaves_its_domain_is_screened(number):
     model, data = fished(), fished_data(number)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # an overflow among them
-        report = run(model, data, ["constant load", "parameter break", "sensor bias"], mode="fast")
+        report = run(model, data, ["constant load"], mode="fast", particles=None, seed=1)
     assert report.verdict == "no measurable gap"
     assert not report.causes.empty
     assert np.isfinite(report.detection["z"]).all()

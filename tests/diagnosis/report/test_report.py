@@ -177,6 +177,16 @@ def test_the_first_sentence_is_the_verdict_with_number_and_uncertainty(name, par
     assert text.endswith(".")
 
 
+def test_the_first_sentence_has_the_p_of_the_gap():
+    """The first of a class may have a p of its own that is no evidence: it said "(p = 1.00)"."""
+    report = effect_found()
+    lost = report.closed.dropna(subset=["F"]).assign(F=NAN, F_low=NAN, F_high=NAN)
+    p = np.where(np.arange(len(report.causes)) == 0, 1.0, 0.02)
+    told = dataclasses.replace(report, closed=lost, causes=report.causes.assign(p=p))
+    assert "(p = 0.020)" in headline(told)
+    assert "p = 1.00" not in headline(told)
+
+
 def test_an_effect_that_gains_nothing_on_data_kept_back_is_said_so():
     report = effect_found()
     lost = report.closed.dropna(subset=["F"]).assign(F=NAN, F_low=NAN, F_high=NAN)
