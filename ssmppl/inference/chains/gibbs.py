@@ -113,7 +113,7 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
         tuning = interweaving.begin() if interweaving is not None else None
         states.append(GibbsState(theta.copy(), generator, stream, tuning))
     report = {
-        "trajectories": "exact, by backward sampling",
+        "trajectories": "exact draws given the data",
         "settings": asdict(method),
         "plan": "\n".join(str(u.explanation) for u in steps.updates),
         "interweaving": interweaved,

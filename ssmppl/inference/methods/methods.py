@@ -77,8 +77,9 @@ class MetropolisHastings:
 @dataclass(frozen=True)
 class Gibbs:
     """Gibbs sampling of a model that is linear and Gaussian or has finitely many states (Schön et
-    al. 2015, section 4.2): trajectories by exact backward sampling (Frühwirth-Schnatter 1994;
-    Carter and Kohn 1994), parameters by the updates that were derived for them.
+    al. 2015, section 4.2): trajectories by exact draws, of up to three states by backward sampling
+    (Frühwirth-Schnatter 1994; Carter and Kohn 1994), of more by Durbin and Koopman's simulation
+    smoother (2002); parameters by the updates that were derived for them.
 
     Parameters
     ----------
