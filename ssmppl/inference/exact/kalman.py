@@ -380,8 +380,8 @@ class KalmanModel(Scored):
     def draw(
         self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 1
     ) -> np.ndarray:
-        """Independent draws of x_{1:T} given y_{1:T}, (draws, T, D): by backward sampling, a single one
-        of many states by the smoothed mean of another record (`kernels/kalman/correction.py`).
+        """Independent draws of x_{1:T} given y_{1:T}, (draws, T, D): by backward sampling, a single
+        one of many states by another record (`codegen/kernels/kalman/correction.py`).
 
         stream : state of the kernels' random numbers, (4,) uint64, advanced in place.
 
