@@ -126,19 +126,31 @@ class Simulator:
             return np.inf
         if self.called:
             return REACHES[-1]
-        if (known := self._known) and known[0] is experiments and np.array_equal(known[1], theta):
+        bounds = middle_and_range(experiments)
+        if not np.any(np.isfinite(bounds[1])):  # inputs of an experiment that is to be made
+            return REACHES[-1]
+        known = self._known
+        if known and np.array_equal(known[1], theta) and _alike(known[0], experiments):
             return known[2]
         stream = random_state(np.random.SeedSequence(PILOTS))
         drawn = [self.observations(e, theta, stream, PILOTS) for e in experiments]
-        reached = _reached(experiments, drawn, middle_and_range(experiments))
+        reached = _reached(experiments, drawn, bounds)
         kept = [float(np.mean(reached <= reach)) for reach in REACHES]
         found = REACHES[-1]
         if kept[-1] == 0.0:
             found = np.inf
         elif kept[-1] < 1.0:
             found = next(r for r, k in zip(REACHES, kept, strict=True) if k >= KEPT * kept[-1])
-        self._known = experiments, theta.copy(), found
+        self._known = tuple(experiments), theta.copy(), found
         return found
+
+
+def _alike(one: Sequence[Experiment], other: Sequence[Experiment]) -> bool:
+    """Whether these are the same data, in another process or list perhaps."""
+    return len(one) == len(other) and all(
+        a is b or all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("y", "seen", "u"))
+        for a, b in zip(one, other, strict=True)
+    )
 
 
 def middle_and_range(experiments: Sequence[Experiment]) -> np.ndarray:

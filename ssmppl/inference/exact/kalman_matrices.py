@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
+from ssmppl.inference.run.problem import EndToEnd
 from ssmppl.language.model.trace import Trace, previous
 
 MOST_KEPT = 4_000_000  # numbers of all roots, which the quick kernel for one draw keeps
@@ -132,31 +132,20 @@ def drawn_by_correction(
     where the quick kernel has none: `drawn` then has it, or says why there is none."""
     if max(e.steps for e in experiments) * len(model.m) ** 2 > MOST_KEPT:
         return None
-    y, seen, first = end_to_end(experiments)
-    out = np.empty((1, len(y), len(model.m)))
-    status, _ = exact_entry("draws_by_correction")(model, start, y, seen, first, stream, out[0])
-    if status != OK:
-        return None
-    return [out[:, a:b] for a, b in pairwise(first.tolist())]
+    every = EndToEnd.of(experiments)
+    out = np.empty((len(every.y), len(model.m)))
+    status, _ = exact_entry("draws_by_correction")(
+        model, start, every.y, every.seen, every.first, stream, out
+    )
+    return [x[None] for x in every.split(out)] if status == OK else None
 
 
 def log_likelihoods(model: Matrices, experiments: Sequence[Experiment]) -> float:
     """log p(y), summed over experiments that share the model, whose start is known."""
-    y, seen, first = end_to_end(experiments)
-    increments = np.empty(len(y))
-    exact_entry("log_likelihoods")(model, model.m[:, None].copy(), y, seen, first, increments)
+    every = EndToEnd.of(experiments)
+    increments, start = np.empty(len(every.y)), model.m[:, None].copy()
+    exact_entry("log_likelihoods")(model, start, every.y, every.seen, every.first, increments)
     return total_of(increments)
-
-
-def end_to_end(experiments: Sequence[Experiment]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """y and seen of all experiments, and where each begins, as kernels over several take them."""
-    first = np.cumsum([0, *(e.steps for e in experiments)])
-    if len(experiments) == 1:
-        return experiments[0].y, experiments[0].seen, first
-    return (
-        np.concatenate([e.y for e in experiments]), np.concatenate([e.seen for e in experiments]),
-        first,
-    )  # fmt: skip
 
 
 def drawn(

@@ -34,9 +34,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.kalman.square_root import (
     NOT_COVARIANCE,
-    NOT_FINITE,
     OK,
-    SINGULAR,
     at,
     begin_roots,
     measure_step,
@@ -48,7 +46,14 @@ from ssmppl.codegen.kernels.kalman.square_root import (
     square_columns,
     update_step,
 )
-from ssmppl.codegen.kernels.kalman.steps import add_known, copy, fill, innovate, log_density
+from ssmppl.codegen.kernels.kalman.steps import (
+    add_known,
+    copy,
+    fill,
+    innovate,
+    log_density,
+    status_of,
+)
 from ssmppl.codegen.kernels.math.flags import exact
 
 # Which adjoints are asked for, in the order of `Matrices`.
@@ -111,10 +116,9 @@ def filter_forward(model, start, y, seen, x, kept, z, roots, log_increment):
             copy(s.root, roots[t])
         innovate(c, s.c, s.counts[1], d, y[t], s.place, k, before, s.array, z[t], x[t])
         increment = log_density(s.array, z[t], k)
-        if increment == np.inf:
-            return SINGULAR, t
-        if not abs(increment) < np.inf:
-            return NOT_FINITE, t
+        status = status_of(increment)
+        if status != OK:
+            return status, t
         log_increment[t] = increment
     return OK, n_steps
 
@@ -146,10 +150,9 @@ def means_forward(model, start, y, seen, x, kept, z, log_increment):
             add_known(a, where_a, count_a, x[t - 1], b, before)
         innovate(c, where_c, count_c, d, y[t], place, k, before, kept[t], z[t], x[t])
         increment = log_density(kept[t], z[t], k)
-        if increment == np.inf:
-            return SINGULAR, t
-        if not abs(increment) < np.inf:
-            return NOT_FINITE, t
+        status = status_of(increment)
+        if status != OK:
+            return status, t
         log_increment[t] = increment
     return OK, n_steps
 

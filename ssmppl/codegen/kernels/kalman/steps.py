@@ -241,10 +241,9 @@ def forward(model, start, y, seen, x, roots, log_increment):
         k = update(model, t, y[t], seen[t], x[t], roots[t], r_root, array, z, filtered)
         copy(array[k : k + n, k : k + n], root)
         increment = log_density(array, z, k)
-        if increment == np.inf:
-            return SINGULAR, t
-        if not abs(increment) < np.inf:
-            return NOT_FINITE, t
+        status = status_of(increment)
+        if status != OK:
+            return status, t
         log_increment[t] = increment
     return OK, n_steps
 
@@ -259,6 +258,14 @@ def update(model, t, y, seen, x, root, r_root, array, z, filtered):
     copy(x, filtered)
     multiply_add(array[k : k + n, :k], z[:k], filtered)
     return k
+
+
+@exact
+def status_of(increment):
+    """What a step's `log_density` says of it."""
+    if increment == np.inf:
+        return SINGULAR
+    return OK if abs(increment) < np.inf else NOT_FINITE
 
 
 @exact
