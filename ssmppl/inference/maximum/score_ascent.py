@@ -29,6 +29,7 @@ from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.methods.methods import ScoreAscent
 from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import choose_kernel
+from ssmppl.inference.particles.filtering import log_of_mean
 from ssmppl.inference.particles.scores import (
     SmootherRun,
     Smoothing,
@@ -46,6 +47,7 @@ PAPER = {"particles": 500, "trajectories": 100, "runs": 1, "iterations": 250}
 LONGEST = 0.5  # of a step, in each unconstrained number
 LEAST_INFORMATION = 0.02  # share of the complete data's information that B has at least
 MEMORY = 0.3  # weight of the newest information in B
+FALL, HALVINGS = 20.0, 24  # nats that a step may cost; of one that costs more, before it is none
 NEAR = 3.0  # squared length of a step, in noise, below which the approach is over
 LEAST_APPROACH, LEAST_AVERAGE = 3, 10  # iterations
 GAIN = 0.6
@@ -71,11 +73,13 @@ class ScoreEstimate:
 
 @dataclass
 class _Iterations:
-    """How far a climb has come."""
+    """How far a climb has come. least : log p(y | theta) below which the next iterate may not
+    fall."""
 
     iterates: list[np.ndarray] = field(default_factory=list)
     near: list[ScoreEstimate] = field(default_factory=list)
     b: np.ndarray | None = None
+    least: float = -np.inf
 
 
 def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
@@ -156,14 +160,21 @@ def _newton(
 def _safe_slope(
     setup: Maximization, way: _Iterations, z: np.ndarray, runs: Runs, k: int
 ) -> tuple[np.ndarray, ScoreEstimate]:
-    """(z, slope there); where the filter fails, at a point on the way back to the last iterate."""
-    for _ in range(6):
+    """(z, slope there); where the filter fails, or the likelihood falls by far more than noise, at
+    a point on the way back to the last iterate: the longest step knows no units, and in a parameter
+    of 1e-5 it leads to where nothing is left to climb by."""
+    for _ in range(HALVINGS):
         try:
-            return z, _slope(setup, z, runs(z, k))
+            slope = _slope(setup, z, runs(z, k))
         except SamplingError:
             if not way.iterates:
                 raise
-            z = 0.5 * (z + way.iterates[-1])
+        else:
+            value = log_of_mean(slope.log_z)[0]
+            if value >= way.least:
+                way.least = value - FALL - 3.0 * float(np.std(slope.log_z))
+                return z, slope
+        z = 0.5 * (z + way.iterates[-1])
     z = way.iterates[-1]
     return z, _slope(setup, z, runs(z, k))
 

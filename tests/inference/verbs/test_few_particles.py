@@ -97,3 +97,35 @@ def test_every_verb_takes_a_proposal_that_reaches_the_rows(sd):
     assert best.parameters["q"] == pytest.approx(q, rel=0.01)
     error = best.attrs["log_likelihood_error"]
     assert best.log_likelihood == pytest.approx(exact(q), abs=5 * error)
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
+def test_steps_in_parameters_of_any_size(seed):
+    """A spread of 1e-5, measured next to exactly: a step of the usual length in its mean was fifty
+    thousand standard deviations, and the end had a log-likelihood of -1e13."""
+    model = ssm.Model("spread")
+    model.prior(lambda: {
+        "phi": ssm.Beta(9, 1), "q": ssm.LogNormal(np.log(1e-5), sd=1), "mu": ssm.Normal(0, sd=1e-4)
+    })  # fmt: skip
+    model.initial(lambda mu: {"x": ssm.Normal(mu, sd=1e-4)})
+    model.transition(lambda x, phi, q, mu: {"x": ssm.StudentT(4, mu + phi * (x - mu), scale=q)})
+    model.observation(lambda x: {"bid": ssm.Normal(x, sd=1e-9)})
+    rng = np.random.default_rng(4)
+    x = [0.0]
+    for _ in range(60):
+        x.append(0.9 * x[-1] + 1e-5 * rng.standard_t(4))
+    x = np.array(x[1:])
+
+    def density(phi, q, mu):
+        steps = stats.t(4, loc=mu + phi * (x[:-1] - mu), scale=q).logpdf(x[1:]).sum()
+        return stats.norm(mu, 1e-4).logpdf(x[0]) + steps
+
+    top = optimize.minimize(
+        lambda z: -density(z[0], 1e-5 * np.exp(z[1]), 1e-5 * z[2]), [0.8, 0.0, 0.0],
+        method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 4000},
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = ssm.maximize(model, {"bid": x}, seed=seed, progress=False)
+    values = density(*(float(found.parameters[n]) for n in ("phi", "q", "mu")))
+    assert -top.fun - 0.02 < values <= -top.fun + 1e-9
